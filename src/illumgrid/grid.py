@@ -1,0 +1,117 @@
+"""The illumination grid: light at the nodes of a lattice, read between them by trilinear interpolation."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from illumgrid.errors import BadInput
+from illumgrid.volume import Floats, Lattice, index_to_world, placement, world_to_index
+
+
+@dataclass(frozen=True, eq=False)
+class GridSpec:
+    """Where the nodes of a grid lie.
+
+    Parameters
+    ----------
+    shape : tuple of int
+        Number of nodes along x, y, z, at least 2 each.
+    origin, spacing, direction
+        As of a `Volume`, for nodes in place of voxel centres.
+    """
+
+    shape: tuple[int, int, int]
+    origin: Floats = field(default_factory=lambda: np.zeros(3))
+    spacing: Floats = field(default_factory=lambda: np.ones(3))
+    direction: Floats = field(default_factory=lambda: np.eye(3))
+
+    def __post_init__(self) -> None:
+        shape = tuple(int(n) for n in self.shape)
+        if len(shape) != 3 or min(shape) < 2:
+            raise BadInput(f"a grid of shape {shape} was asked for; expected at least 2 nodes along each of three axes")
+        object.__setattr__(self, "shape", shape)
+        for name, value in zip(
+            ("origin", "spacing", "direction"), placement(self.origin, self.spacing, self.direction)
+        ):
+            value.setflags(write=False)
+            object.__setattr__(self, name, value)
+
+    @classmethod
+    def over(cls, lattice: Lattice, longest: int) -> "GridSpec":
+        """Nodes from the first to the last voxel centre, `longest` along the axis with most voxels.
+
+        Axis i gets max(2, 1 + round((n_i - 1)(longest - 1)/(n_max - 1))) nodes: with `longest` = n_max they are the voxels.
+        """
+        if longest < 2:
+            raise BadInput(f"a grid of {longest} nodes was asked for; expected at least 2 along the longest axis")
+        voxels = np.array(lattice.shape)
+        # floor(x + 1/2): Python and NumPy round halves to even, which is not what a reader of the formula expects.
+        nodes = np.maximum(2, 1 + np.floor((voxels - 1) * (longest - 1) / (voxels.max() - 1) + 0.5).astype(int))
+        spacing = np.where(nodes == voxels, lattice.spacing, lattice.spacing * (voxels - 1) / (nodes - 1))
+        return cls((int(nodes[0]), int(nodes[1]), int(nodes[2])), lattice.origin, spacing, lattice.direction)
+
+    def nodes(self, flat: NDArray[np.integer] | None = None) -> Floats:
+        """World positions (n, 3) of the nodes with these flat C-order numbers, by default of all."""
+        numbers = np.arange(np.prod(self.shape)) if flat is None else flat
+        return index_to_world(self, np.stack(np.unravel_index(numbers, self.shape), axis=-1))
+
+
+@dataclass(frozen=True, eq=False)
+class IlluminationGrid:
+    """Light at every node, for the level set that passes through it.
+
+    Parameters
+    ----------
+    spec : GridSpec
+    values : (nx, ny, nz, 3) float32
+        Irradiance, linear RGB. A node without support holds the value of the nearest supported one.
+    error : (nx, ny, nz) float32
+        Standard error of the node, root mean square over RGB; infinite without support.
+    support : (nx, ny, nz) float32
+        Number of samples that the node rests upon; 0 marks a hole.
+    """
+
+    spec: GridSpec
+    values: NDArray[np.float32]
+    error: NDArray[np.float32]
+    support: NDArray[np.float32]
+
+    def __post_init__(self) -> None:
+        shape = tuple(self.spec.shape)
+        for name, expected in (("values", (*shape, 3)), ("error", shape), ("support", shape)):
+            array = np.ascontiguousarray(getattr(self, name), dtype=np.float32)
+            if array.shape != expected:
+                raise BadInput(f"the {name} of a grid have shape {array.shape}; expected {expected}")
+            object.__setattr__(self, name, array)
+
+    def lookup(self, points: ArrayLike) -> NDArray[np.float32]:
+        """Irradiance (n, 3) at world points (n, 3), trilinear between nodes; beyond the border, that of the border.
+
+        Never NaN: coordinates that are not finite read the border.
+        """
+        return read_lattice(self.spec, self.values, points)
+
+
+def read_lattice(spec: Lattice, values: NDArray[np.float32], points: ArrayLike) -> NDArray[np.float32]:
+    """Trilinear `values` (nx, ny, nz, m) at world points (n, 3), clamped to the border: (n, m)."""
+    world = np.asarray(points, dtype=float).reshape(-1, 3)
+    index = world_to_index(spec, np.nan_to_num(world))
+    cell = np.clip(np.floor(index), 0, np.array(spec.shape) - 2).astype(np.int64)
+    f = np.clip(index - cell, 0.0, 1.0).astype(np.float32)
+    result = np.zeros((len(world), values.shape[3]), dtype=np.float32)
+    for corner in np.ndindex(2, 2, 2):
+        weight = np.where(corner, f, 1 - f).prod(axis=1, keepdims=True)
+        result += weight * values[tuple((cell + corner).T)]
+    return result
+
+
+def fill_holes(spec: Lattice, values: NDArray[np.float32], support: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Give nodes of support 0 the value of the nearest supported node, so that lookup is never black and never NaN."""
+    holes = support == 0
+    if not holes.any() or holes.all():
+        return values
+    from scipy.ndimage import distance_transform_edt
+
+    nearest = distance_transform_edt(holes, sampling=spec.spacing, return_distances=False, return_indices=True)
+    return np.asarray(values[tuple(nearest)])

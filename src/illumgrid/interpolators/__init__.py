@@ -1,0 +1,1 @@
+"""From scattered answers to a uniform grid: one file an interpolator."""

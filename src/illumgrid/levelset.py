@@ -1,0 +1,144 @@
+"""A level set, as a mesh and as something to march through."""
+
+import weakref
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from illumgrid.errors import BadInput
+from illumgrid.scene import Scene
+from illumgrid.volume import Floats, Side, Volume, index_to_world
+
+if TYPE_CHECKING:
+    import trimesh
+
+BRICK = 4
+"""Cells along the side of a brick."""
+
+
+def off_the_data(volume: Volume, isovalue: float, inside: Side) -> float:
+    """Nudge an isovalue that is also a data value by an ulp, towards the side that keeps the solid {h >= c} (or <=).
+
+    An extraction exactly at data values leaves duplicate faces and holes.
+    """
+    level = np.float32(isovalue)
+    if not (volume.values == level).any():
+        return float(isovalue)
+    return float(np.nextafter(level, np.float32(-np.inf if inside == "above" else np.inf)))
+
+
+def isosurface(volume: Volume, isovalue: float, inside: Side = "above", capped: bool = False) -> "trimesh.Trimesh":
+    """Mesh of the level set {h = isovalue}.
+
+    Parameters
+    ----------
+    volume : Volume
+    isovalue : float
+    inside : {"above", "below"}
+        Which side is solid; the faces look away from it.
+    capped : bool
+        Close the solid where it meets the border of the volume: the mesh is then watertight.
+
+    Returns
+    -------
+    trimesh.Trimesh
+        World units, normals towards the outside; empty when no voxel edge crosses the isovalue.
+
+    References
+    ----------
+    .. [1] T. Lewiner, H. Lopes, A. W. Vieira, G. Tavares, "Efficient implementation of marching cubes' cases with
+           topological guarantees", J. Graphics Tools 8(2), 2003 (scikit-image's ``marching_cubes``).
+    """
+    import trimesh
+    from skimage.measure import marching_cubes
+
+    if not np.isfinite(isovalue):
+        raise BadInput(f"the isovalue is {isovalue}; expected a finite number")
+    if inside not in ("above", "below"):
+        raise BadInput(f"inside is {inside!r}; expected 'above' or 'below'")
+    level = off_the_data(volume, isovalue, inside)
+    values = volume.values
+    if capped:
+        spread = max(float(np.ptp(values)), abs(level), 1e-30)
+        beyond = min(values.min(), level) - spread if inside == "above" else max(values.max(), level) + spread
+        values = np.pad(values, 1, constant_values=np.float32(beyond))
+    if not values.min() < level < values.max():
+        return trimesh.Trimesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64))
+    # "descent": what is higher than the level is the object, and faces turn away from it.
+    index, faces, _, _ = marching_cubes(values, level, gradient_direction="descent" if inside == "above" else "ascent")
+    index = index.astype(float) - (1.0 if capped else 0.0)
+    index = np.clip(index, 0.0, np.array(volume.shape) - 1.0)
+    if np.linalg.det(volume.direction) < 0:
+        faces = faces[:, ::-1]
+    return trimesh.Trimesh(index_to_world(volume, index), faces, process=False)
+
+
+class Marchable(NamedTuple):
+    """All fields of a scene as flat arrays that a compiled kernel marches through, in the frame of the scene.
+
+    Every field is turned so that its solid is {v >= level}: for `inside` "below" v = -h and levels change sign too.
+    The bricks serve every isovalue: a brick whose largest v is below the level is empty.
+    """
+
+    values: NDArray[np.float32]  # all fields, one after the other, C order
+    start: NDArray[np.int64]  # (F,) where each begins
+    shape: NDArray[np.int64]  # (F, 3) voxels
+    origin: Floats  # (F, 3) frame position of voxel 0
+    spacing: Floats  # (F, 3)
+    bricks: NDArray[np.float32]  # largest v of each brick, all fields, C order
+    brick_start: NDArray[np.int64]  # (F,)
+    brick_shape: NDArray[np.int64]  # (F, 3)
+    albedo: Floats  # (F, 3)
+    emission: Floats  # (F, 3)
+    background: Floats  # (3,)
+
+
+_turned: "weakref.WeakKeyDictionary[Volume, dict[Side, tuple[NDArray[np.float32], NDArray[np.float32]]]]"
+_turned = weakref.WeakKeyDictionary()
+
+
+def _brick_maxima(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Largest value over the (BRICK + 1)³ voxels of each brick of BRICK³ cells."""
+    for axis in range(3):
+        line = np.moveaxis(values, axis, 0)
+        starts = np.arange(0, len(line) - 1, BRICK)
+        inner = np.maximum.reduceat(line, starts, axis=0)
+        # reduceat ends before the next brick's first voxel, which is this brick's last one too.
+        last = line[np.minimum(starts + BRICK, len(line) - 1)]
+        values = np.moveaxis(np.maximum(inner, last), 0, axis)
+    return np.ascontiguousarray(values)
+
+
+def turned(volume: Volume, inside: Side) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Values with the solid upwards, and their brick maxima; built once for each volume and side."""
+    known = _turned.setdefault(volume, {})
+    if inside not in known:
+        values = volume.values if inside == "above" else -volume.values
+        known[inside] = values, _brick_maxima(values)
+    return known[inside]
+
+
+def marchable(scene: Scene) -> Marchable:
+    """Lay out a scene for marching; one field costs no copy."""
+    parts = [turned(f.volume, f.inside) for f in scene.fields]
+    values = [p[0].reshape(-1) for p in parts]
+    bricks = [p[1].reshape(-1) for p in parts]
+    return Marchable(
+        values=values[0] if len(parts) == 1 else np.concatenate(values),
+        start=np.cumsum([0, *(len(v) for v in values)], dtype=np.int64)[:-1],
+        shape=np.array([p[0].shape for p in parts], dtype=np.int64),
+        origin=scene.to_frame([f.volume.origin for f in scene.fields]),
+        spacing=np.array([f.volume.spacing for f in scene.fields]),
+        bricks=bricks[0] if len(parts) == 1 else np.concatenate(bricks),
+        brick_start=np.cumsum([0, *(len(b) for b in bricks)], dtype=np.int64)[:-1],
+        brick_shape=np.array([p[1].shape for p in parts], dtype=np.int64),
+        albedo=np.array([f.material.albedo for f in scene.fields]),
+        emission=np.array([f.material.emission for f in scene.fields]),
+        background=np.array(scene.background),
+    )
+
+
+def upward(scene: Scene) -> Floats:
+    """+1 or -1 for each field (F,): what turns h and its isovalues so that the solid is upwards."""
+    return np.array([1.0 if f.inside == "above" else -1.0 for f in scene.fields])

@@ -1,0 +1,1 @@
+"""Where to ask for light: one file a sampler."""
