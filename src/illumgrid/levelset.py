@@ -58,7 +58,7 @@ def isosurface(volume: Volume, isovalue: float, inside: Side = "above", capped: 
     if inside not in ("above", "below"):
         raise BadInput(f"inside is {inside!r}; expected 'above' or 'below'")
     level = off_the_data(volume, isovalue, inside)
-    values = volume.values
+    values = volume.values.copy()  # the extraction wants a writeable buffer
     if capped:
         spread = max(float(np.ptp(values)), abs(level), 1e-30)
         beyond = min(values.min(), level) - spread if inside == "above" else max(values.max(), level) + spread

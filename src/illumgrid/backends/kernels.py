@@ -1,0 +1,453 @@
+"""The compiled call tree: marching rays through trilinear fields, and walking light paths.
+
+All of it lives in this one file because Numba's disk cache does not see edits elsewhere; its only import is the frozen
+`rng`. Kernels are serial, release the GIL and depend on nothing but their arguments; threads are the caller's business.
+
+A field comes as {v >= level}: `illumgrid.levelset.Marchable` has turned it so. Index coordinates of field f are
+(x - origin[f]) / spacing[f] for x in the frame of the scene; t is world distance throughout.
+"""
+
+import numba
+import numpy as np
+from numba.extending import register_jitable
+
+from illumgrid.rng import draw, mix, stream
+
+for _function in (mix, stream, draw):
+    register_jitable(_function)
+
+# No fastmath: a miss is t = inf, and the sign of a coefficient near zero decides the side.
+jit = numba.njit(cache=True, nogil=True, error_model="numpy")
+
+MISS, SURFACE, CAP, BURIED = 0, 1, 2, 3  # what a ray meets: nothing, a level set, a cap, the inside of a solid
+BRICK_SHIFT = 2  # bricks of 4 cells a side, as in levelset.BRICK
+ON_A_VOXEL = 1e-7  # as in illumgrid.volume
+
+
+@jit
+def first_cell(u, d, last):
+    """Cell along one axis that a ray enters at index coordinate u; outside 0 .. last - 1 it leaves the field at once."""
+    cell = int(np.floor(u))
+    if u == cell and (d < 0.0 or (d == 0.0 and cell == last)):
+        cell -= 1
+    return cell
+
+
+@jit
+def snap(u):
+    """Index coordinate of a node that lies on a voxel."""
+    nearest = np.round(u)
+    return nearest if abs(u - nearest) < ON_A_VOXEL else u
+
+
+@jit
+def first_root(q0, q1, q2, q3, end):
+    """Smallest t in [0, end] at which q0 + q1 t + q2 t² + q3 t³ reaches 0 from q0 < 0; inf if none."""
+    # On [0, 1]: the Bernstein coefficients bound the cubic, and most cells end here.
+    a, b, c = q1 * end, q2 * end * end, q3 * end * end * end
+    if q0 + a / 3.0 < 0.0 and q0 + (2.0 * a + b) / 3.0 < 0.0 and q0 + a + b + c < 0.0:
+        return np.inf
+    # The roots of the derivative part [0, 1] into monotone pieces.
+    low, high = 2.0, 2.0
+    half = b * b - 3.0 * a * c
+    if half > 0.0:
+        q = -(b + np.copysign(np.sqrt(half), b))
+        low, high = q / (3.0 * c), a / q
+        if low > high:
+            low, high = high, low
+    left = 0.0
+    for piece in range(3):
+        right = low if piece == 0 else (high if piece == 1 else 1.0)
+        if piece < 2 and not (left < right < 1.0):
+            continue
+        if q0 + right * (a + right * (b + right * c)) >= 0.0:
+            # One root in [left, right], on a rising piece: Newton steps, bisection where they leave the bracket.
+            s = 0.5 * (left + right)
+            for _ in range(60):
+                value = q0 + s * (a + s * (b + s * c))
+                if value >= 0.0:
+                    right = s
+                else:
+                    left = s
+                after = s - value / (a + s * (2.0 * b + 3.0 * c * s))
+                if not (left < after < right):
+                    after = 0.5 * (left + right)
+                if abs(after - s) < 1e-14:
+                    break
+                s = after
+            return s * end
+        left = right
+    return np.inf
+
+
+@jit
+def next_root(q1, q2, q3, end):
+    """Smallest t in [0, end] at which t (q1 + q2 t + q3 t²) reaches 0 from below, its root at 0 divided out.
+
+    A ray that starts on the level set: 0 if it dips under the surface at once, inf if it does not come back.
+    """
+    a, b, c = q1 * end, q2 * end * end, q3 * end * end * end
+    if a == 0.0:
+        if b > 0.0 or (b == 0.0 and c > 0.0):
+            return 0.0
+        return -b / c * end if c > 0.0 and -b <= c else np.inf
+    if a > 0.0:
+        return 0.0
+    if a + 0.5 * b < 0.0 and a + b + c < 0.0:
+        return np.inf
+    disc = b * b - 4.0 * a * c
+    if disc < 0.0:
+        return np.inf
+    q = -0.5 * (b + np.copysign(np.sqrt(disc), b))
+    one, other = q / c, a / q
+    best = np.inf
+    if 0.0 < one <= 1.0:
+        best = one
+    if 0.0 < other <= 1.0 and other < best:
+        best = other
+    return best * end
+
+
+@jit
+def cubic(values, corner, step_x, step_y, level, ex, ey, ez, dx, dy, dz):
+    """Coefficients of v - level along a ray through a trilinear cell, from its entry e in [0, 1]³.
+
+    `corner` is the flat number of the cell's first voxel. Parker et al., "Interactive ray tracing for isosurface
+    rendering", IEEE Visualization 1998, with the interpolation nested so that equal values cancel exactly.
+    """
+    f000 = values[corner] - level
+    f001 = values[corner + 1] - level
+    f010 = values[corner + step_y] - level
+    f011 = values[corner + step_y + 1] - level
+    corner += step_x
+    x00, x01 = values[corner] - level - f000, values[corner + 1] - level - f001
+    x10, x11 = values[corner + step_y] - level - f010, values[corner + step_y + 1] - level - f011
+    # Along x: four edges, linear in t.
+    a00, a01, a10, a11 = f000 + x00 * ex, f001 + x01 * ex, f010 + x10 * ex, f011 + x11 * ex
+    s00, s01, s10, s11 = x00 * dx, x01 * dx, x10 * dx, x11 * dx
+    # Along y: two faces, quadratic.
+    y0, y1, r0, r1 = a10 - a00, a11 - a01, s10 - s00, s11 - s01
+    b0, b1, b2 = a00 + y0 * ey, s00 + r0 * ey + y0 * dy, r0 * dy
+    c0, c1, c2 = a01 + y1 * ey, s01 + r1 * ey + y1 * dy, r1 * dy
+    # Along z: the cell, cubic.
+    z0, z1, z2 = c0 - b0, c1 - b1, c2 - b2
+    return b0 + z0 * ez, b1 + z1 * ez + z0 * dz, b2 + z2 * ez + z1 * dz, z2 * dz
+
+
+@jit
+def enter(u, d, last, t_in, t_out, axis, face):
+    """Clip a ray to 0 <= u + t d <= last along one axis."""
+    if d == 0.0:
+        if u < 0.0 or u > last:
+            t_out = -np.inf
+    else:
+        near, far = -u / d, (last - u) / d
+        if near > far:
+            near, far = far, near
+        if near > t_in:
+            t_in, face = near, axis
+        t_out = min(t_out, far)
+    return t_in, t_out, face
+
+
+@jit
+def follow(u, t, d, low, high):
+    """Cell, of those from low to high, at distance t along one axis."""
+    return min(max(int(np.floor(u + t * d)), low), high)
+
+
+@jit
+def march(scene, f, level, ux, uy, uz, dx, dy, dz, on_surface, limit):
+    """First meeting of a ray with the solid of field f, in index coordinates u + t d.
+
+    Two-level traversal (Amanatides & Woo 1987) over bricks and cells; a brick or cell all below the level is empty.
+    `on_surface`: the ray starts on the level set itself, outside. Returns (t, what, face), face the axis of a cap.
+    """
+    last_x, last_y, last_z = scene.shape[f, 0] - 1, scene.shape[f, 1] - 1, scene.shape[f, 2] - 1
+    t, t_out, face = 0.0, limit, -1
+    t, t_out, face = enter(ux, dx, last_x, t, t_out, 0, face)
+    t, t_out, face = enter(uy, dy, last_y, t, t_out, 1, face)
+    t, t_out, face = enter(uz, dz, last_z, t, t_out, 2, face)
+    if t > t_out:
+        return np.inf, MISS, -1
+    px = min(max(ux + t * dx, 0.0), last_x) if face != 0 else (0.0 if dx > 0.0 else 1.0 * last_x)
+    py = min(max(uy + t * dy, 0.0), last_y) if face != 1 else (0.0 if dy > 0.0 else 1.0 * last_y)
+    pz = min(max(uz + t * dz, 0.0), last_z) if face != 2 else (0.0 if dz > 0.0 else 1.0 * last_z)
+    cx, cy, cz = first_cell(px, dx, last_x), first_cell(py, dy, last_y), first_cell(pz, dz, last_z)
+    if cx < 0 or cy < 0 or cz < 0 or cx >= last_x or cy >= last_y or cz >= last_z:
+        return np.inf, MISS, -1
+    step_y, start = scene.shape[f, 2], scene.start[f]
+    step_x = step_y * scene.shape[f, 1]
+    if not on_surface:
+        corner = start + cx * step_x + cy * step_y + cz
+        q0, _, _, _ = cubic(scene.values, corner, step_x, step_y, level, px - cx, py - cy, pz - cz, dx, dy, dz)
+        if q0 >= 0.0:
+            return t, (CAP if face >= 0 else BURIED), face
+
+    brick_y = scene.brick_shape[f, 2]
+    brick_x = brick_y * scene.brick_shape[f, 1]
+    brick_start = scene.brick_start[f]
+    # A plane at index coordinate p is met at t = p i + k; a ray parallel to it never does: i = 0, k = inf.
+    ix, kx = (1.0 / dx, -ux / dx) if dx != 0.0 else (0.0, np.inf)
+    iy, ky = (1.0 / dy, -uy / dy) if dy != 0.0 else (0.0, np.inf)
+    iz, kz = (1.0 / dz, -uz / dz) if dz != 0.0 else (0.0, np.inf)
+    ahead_x, ahead_y, ahead_z = int(dx > 0.0), int(dy > 0.0), int(dz > 0.0)
+    while True:
+        bx, by, bz = cx >> BRICK_SHIFT, cy >> BRICK_SHIFT, cz >> BRICK_SHIFT
+        low_x, low_y, low_z = bx << BRICK_SHIFT, by << BRICK_SHIFT, bz << BRICK_SHIFT
+        high_x, high_y, high_z = min(low_x + 4, last_x), min(low_y + 4, last_y), min(low_z + 4, last_z)
+        if scene.bricks[brick_start + bx * brick_x + by * brick_y + bz] < level:
+            # Leave an empty brick in one step.
+            on_surface = False
+            tx = (high_x if ahead_x else low_x) * ix + kx
+            ty = (high_y if ahead_y else low_y) * iy + ky
+            tz = (high_z if ahead_z else low_z) * iz + kz
+            t = max(t, min(tx, ty, tz))
+            if t >= t_out:
+                return np.inf, MISS, -1
+            if tx <= ty and tx <= tz:
+                cx = high_x if ahead_x else low_x - 1
+                cy, cz = follow(uy, t, dy, low_y, high_y - 1), follow(uz, t, dz, low_z, high_z - 1)
+            elif ty <= tz:
+                cy = high_y if ahead_y else low_y - 1
+                cx, cz = follow(ux, t, dx, low_x, high_x - 1), follow(uz, t, dz, low_z, high_z - 1)
+            else:
+                cz = high_z if ahead_z else low_z - 1
+                cx, cy = follow(ux, t, dx, low_x, high_x - 1), follow(uy, t, dy, low_y, high_y - 1)
+        else:
+            # Go from cell to cell within a brick.
+            while low_x <= cx < high_x and low_y <= cy < high_y and low_z <= cz < high_z:
+                tx, ty, tz = (cx + ahead_x) * ix + kx, (cy + ahead_y) * iy + ky, (cz + ahead_z) * iz + kz
+                t_next = max(t, min(tx, ty, tz))
+                corner = start + cx * step_x + cy * step_y + cz
+                across = corner + step_x
+                v = scene.values
+                if (
+                    max(v[corner], v[corner + 1], v[corner + step_y], v[corner + step_y + 1]) >= level
+                    or max(v[across], v[across + 1], v[across + step_y], v[across + step_y + 1]) >= level
+                ):
+                    ex = min(max(ux + t * dx - cx, 0.0), 1.0)
+                    ey = min(max(uy + t * dy - cy, 0.0), 1.0)
+                    ez = min(max(uz + t * dz - cz, 0.0), 1.0)
+                    q0, q1, q2, q3 = cubic(v, corner, step_x, step_y, level, ex, ey, ez, dx, dy, dz)
+                    if on_surface:
+                        root = next_root(q1, q2, q3, t_next - t)
+                    elif q0 >= 0.0:
+                        root = 0.0
+                    else:
+                        root = first_root(q0, q1, q2, q3, t_next - t)
+                    if root < np.inf:
+                        t += root
+                        return (t, SURFACE, -1) if t < limit else (np.inf, MISS, -1)
+                on_surface = False
+                t = t_next
+                if tx <= ty and tx <= tz:
+                    cx += 2 * ahead_x - 1
+                elif ty <= tz:
+                    cy += 2 * ahead_y - 1
+                else:
+                    cz += 2 * ahead_z - 1
+                if t >= t_out:
+                    return np.inf, MISS, -1
+        if cx < 0 or cy < 0 or cz < 0 or cx >= last_x or cy >= last_y or cz >= last_z:
+            return np.inf, MISS, -1
+
+
+@jit
+def nearest_hit(scene, level, x, y, z, dx, dy, dz, on, on_cap):
+    """First surface of any field along the frame ray x + t d, from the surface of field `on` (-1: from nowhere).
+
+    Returns (t, field, what, face). From a cap, the convex box of the field's own volume cannot be met again.
+    """
+    best, field, what, face = np.inf, -1, MISS, -1
+    for f in range(scene.start.shape[0]):
+        if f == on and on_cap:
+            continue
+        sx, sy, sz = scene.spacing[f, 0], scene.spacing[f, 1], scene.spacing[f, 2]
+        ux, uy, uz = (x - scene.origin[f, 0]) / sx, (y - scene.origin[f, 1]) / sy, (z - scene.origin[f, 2]) / sz
+        if f == on:
+            ux, uy, uz = snap(ux), snap(uy), snap(uz)
+        t, hit, side = march(scene, f, level[f], ux, uy, uz, dx / sx, dy / sy, dz / sz, f == on, best)
+        if hit != MISS and t < best:
+            best, field, what, face = t, f, hit, side
+    return best, field, what, face
+
+
+@jit
+def outward(gx, gy, gz):
+    """Unit vector against the gradient of v; 0 on a plateau. Scaled first: the square of a tiny slope underflows."""
+    largest = max(abs(gx), abs(gy), abs(gz))
+    if largest == 0.0:
+        return 0.0, 0.0, 0.0
+    gx, gy, gz = gx / largest, gy / largest, gz / largest
+    length = np.sqrt(gx * gx + gy * gy + gz * gz)
+    return -gx / length, -gy / length, -gz / length
+
+
+@jit
+def gradient_normal(scene, f, ux, uy, uz):
+    """Outward normal at index u of field f: central differences (one-sided at the border), interpolated trilinearly.
+
+    Where they cancel, that of the trilinear cell.
+    """
+    last_x, last_y, last_z = scene.shape[f, 0] - 1, scene.shape[f, 1] - 1, scene.shape[f, 2] - 1
+    cx, cy, cz = follow(ux, 0.0, 0.0, 0, last_x - 1), follow(uy, 0.0, 0.0, 0, last_y - 1), follow(uz, 0.0, 0.0, 0, last_z - 1)
+    wx, wy, wz = min(max(ux - cx, 0.0), 1.0), min(max(uy - cy, 0.0), 1.0), min(max(uz - cz, 0.0), 1.0)
+    step_y = scene.shape[f, 2]
+    step_x = step_y * scene.shape[f, 1]
+    v, start = scene.values, scene.start[f]
+    gx, gy, gz = 0.0, 0.0, 0.0
+    for corner in range(8):
+        i, j, k = corner >> 2, (corner >> 1) & 1, corner & 1
+        weight = (wx if i else 1.0 - wx) * (wy if j else 1.0 - wy) * (wz if k else 1.0 - wz)
+        here = start + (cx + i) * step_x + (cy + j) * step_y + cz + k
+        after, before = int(cx + i < last_x), int(cx + i > 0)
+        gx += weight * (np.float64(v[here + after * step_x]) - v[here - before * step_x]) / (after + before)
+        after, before = int(cy + j < last_y), int(cy + j > 0)
+        gy += weight * (np.float64(v[here + after * step_y]) - v[here - before * step_y]) / (after + before)
+        after, before = int(cz + k < last_z), int(cz + k > 0)
+        gz += weight * (np.float64(v[here + after]) - v[here - before]) / (after + before)
+    sx, sy, sz = scene.spacing[f, 0], scene.spacing[f, 1], scene.spacing[f, 2]
+    if gx == 0.0 and gy == 0.0 and gz == 0.0:
+        here = start + cx * step_x + cy * step_y + cz
+        _, gx, _, _ = cubic(v, here, step_x, step_y, 0.0, wx, wy, wz, 1.0, 0.0, 0.0)
+        _, gy, _, _ = cubic(v, here, step_x, step_y, 0.0, wx, wy, wz, 0.0, 1.0, 0.0)
+        _, gz, _, _ = cubic(v, here, step_x, step_y, 0.0, wx, wy, wz, 0.0, 0.0, 1.0)
+    return outward(gx / sx, gy / sy, gz / sz)
+
+
+@jit
+def hit_normal(scene, f, what, face, x, y, z, dx, dy, dz):
+    """Outward normal where a ray met field f: the gradient normal, or that of the cap's face."""
+    if what == CAP:
+        return (
+            -np.copysign(1.0, dx) if face == 0 else 0.0,
+            -np.copysign(1.0, dy) if face == 1 else 0.0,
+            -np.copysign(1.0, dz) if face == 2 else 0.0,
+        )
+    ux, uy, uz = x - scene.origin[f, 0], y - scene.origin[f, 1], z - scene.origin[f, 2]
+    return gradient_normal(scene, f, ux / scene.spacing[f, 0], uy / scene.spacing[f, 1], uz / scene.spacing[f, 2])
+
+
+@jit
+def cosine_direction(u1, u2, nx, ny, nz):
+    """Direction with density cosine / π about the normal n, from two uniform numbers.
+
+    Malley's method; the frame by Duff et al., "Building an orthonormal basis, revisited", JCGT 6(1), 2017.
+    """
+    radius, angle = np.sqrt(u1), 2.0 * np.pi * u2
+    x, y, z = radius * np.cos(angle), radius * np.sin(angle), np.sqrt(1.0 - u1)
+    sign = 1.0 if nz >= 0.0 else -1.0
+    a = -1.0 / (sign + nz)
+    b = nx * ny * a
+    return (
+        x * (1.0 + sign * nx * nx * a) + y * b + z * nx,
+        x * sign * b + y * (sign + ny * ny * a) + z * ny,
+        -x * sign * nx - y * ny + z * nz,
+    )
+
+
+@jit
+def buried(scene, level, x, y, z, own):
+    """Whether the frame point x lies inside the solid of a field other than `own`."""
+    for f in range(scene.start.shape[0]):
+        if f == own:
+            continue
+        _, what, _ = march(
+            scene,
+            f,
+            level[f],
+            (x - scene.origin[f, 0]) / scene.spacing[f, 0],
+            (y - scene.origin[f, 1]) / scene.spacing[f, 1],
+            (z - scene.origin[f, 2]) / scene.spacing[f, 2],
+            1.0,
+            0.0,
+            0.0,
+            False,
+            1e-300,
+        )
+        if what == BURIED:
+            return True
+    return False
+
+
+@jit
+def walk(scene, key, path, bounces, level, own, x, y, z, nx, ny, nz):
+    """Worth (red, green, blue) of one path from a point on the level set of field `own`: its irradiance is π times the mean."""
+    red, green, blue = 0.0, 0.0, 0.0
+    keep_red, keep_green, keep_blue = 1.0, 1.0, 1.0  # throughput: share of the light that comes back along the path
+    on, on_cap = own, False
+    for segment in range(bounces + 1):
+        # Choose a direction by the cosine about the gradient normal.
+        u1 = draw(key, path, np.uint64(2 * segment))
+        u2 = draw(key, path, np.uint64(2 * segment + 1))
+        dx, dy, dz = cosine_direction(u1, u2, nx, ny, nz)
+
+        # Follow the ray to the nearest surface; one that dips under its own has hit it already.
+        t, field, what, face = nearest_hit(scene, level, x, y, z, dx, dy, dz, on, on_cap)
+
+        # A path that escapes sees the background, and ends.
+        if what == MISS:
+            red += keep_red * scene.background[0]
+            green += keep_green * scene.background[1]
+            blue += keep_blue * scene.background[2]
+            break
+
+        # A path inside a solid carries no light.
+        if what == BURIED:
+            break
+
+        # Account for what the surface emits.
+        red += keep_red * scene.emission[field, 0]
+        green += keep_green * scene.emission[field, 1]
+        blue += keep_blue * scene.emission[field, 2]
+
+        # Reflect: the albedo takes its share, and the path goes on from the hit.
+        keep_red *= scene.albedo[field, 0]
+        keep_green *= scene.albedo[field, 1]
+        keep_blue *= scene.albedo[field, 2]
+        on, on_cap = field, what == CAP
+        if t > 0.0:
+            x, y, z = x + t * dx, y + t * dy, z + t * dz
+            nx, ny, nz = hit_normal(scene, field, what, face, x, y, z, dx, dy, dz)
+            if nx == 0.0 and ny == 0.0 and nz == 0.0:
+                break
+    return red, green, blue
+
+
+@jit
+def solve_queries(scene, ids, point, normal, level, target, first, count, bounces, seed, mean, m2, paths):
+    """Irradiance at each query (frame coordinates), from paths number first .. first + count - 1; mean, m2, paths are filled."""
+    for i in range(ids.shape[0]):
+        x, y, z = point[i, 0], point[i, 1], point[i, 2]
+        nx, ny, nz = normal[i, 0], normal[i, 1], normal[i, 2]
+        if (nx == 0.0 and ny == 0.0 and nz == 0.0) or buried(scene, level[i], x, y, z, target[i]):
+            continue
+        key = stream(seed, ids[i])
+        mean_r, mean_g, mean_b, m2_r, m2_g, m2_b = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        for n in range(count):
+            path = np.uint64(first + n)
+            red, green, blue = walk(scene, key, path, bounces, level[i], target[i], x, y, z, nx, ny, nz)
+            # Welford's update: the spread without cancellation.
+            off_r, off_g, off_b = np.pi * red - mean_r, np.pi * green - mean_g, np.pi * blue - mean_b
+            mean_r, mean_g, mean_b = mean_r + off_r / (n + 1), mean_g + off_g / (n + 1), mean_b + off_b / (n + 1)
+            m2_r += off_r * (np.pi * red - mean_r)
+            m2_g += off_g * (np.pi * green - mean_g)
+            m2_b += off_b * (np.pi * blue - mean_b)
+        mean[i, 0], mean[i, 1], mean[i, 2] = mean_r, mean_g, mean_b
+        m2[i, 0], m2[i, 1], m2[i, 2] = m2_r, m2_g, m2_b
+        paths[i] = count
+
+
+@jit
+def cast_rays(scene, level, origin, direction, on, t, field, what, normal):
+    """First hits of frame rays (n, 3), all under one row of levels; t, field, what and normal are filled."""
+    for i in range(origin.shape[0]):
+        x, y, z = origin[i, 0], origin[i, 1], origin[i, 2]
+        dx, dy, dz = direction[i, 0], direction[i, 1], direction[i, 2]
+        t[i], field[i], what[i], face = nearest_hit(scene, level, x, y, z, dx, dy, dz, on, False)
+        if what[i] == SURFACE or what[i] == CAP:
+            hx, hy, hz = x + t[i] * dx, y + t[i] * dy, z + t[i] * dz
+            normal[i, 0], normal[i, 1], normal[i, 2] = hit_normal(
+                scene, field[i], what[i], face, hx, hy, hz, dx, dy, dz
+            )
