@@ -95,14 +95,13 @@ class IlluminationGrid:
 
 def read_lattice(spec: Lattice, values: NDArray[np.float32], points: ArrayLike) -> NDArray[np.float32]:
     """Trilinear `values` (nx, ny, nz, m) at world points (n, 3), clamped to the border: (n, m)."""
+    from scipy.ndimage import map_coordinates
+
     world = np.asarray(points, dtype=float).reshape(-1, 3)
-    index = world_to_index(spec, np.nan_to_num(world))
-    cell = np.clip(np.floor(index), 0, np.array(spec.shape) - 2).astype(np.int64)
-    f = np.clip(index - cell, 0.0, 1.0).astype(np.float32)
+    index = world_to_index(spec, np.nan_to_num(world)).T
     result = np.zeros((len(world), values.shape[3]), dtype=np.float32)
-    for corner in np.ndindex(2, 2, 2):
-        weight = np.where(corner, f, 1 - f).prod(axis=1, keepdims=True)
-        result += weight * values[tuple((cell + corner).T)]
+    for channel in range(values.shape[3]):
+        map_coordinates(values[..., channel], index, output=result[:, channel], order=1, mode="nearest")
     return result
 
 

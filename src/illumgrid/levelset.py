@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from illumgrid.errors import BadInput
+from illumgrid.samples import Queries
 from illumgrid.scene import Scene
 from illumgrid.volume import Floats, Side, Volume, index_to_world
 
@@ -142,3 +143,9 @@ def marchable(scene: Scene) -> Marchable:
 def upward(scene: Scene) -> Floats:
     """+1 or -1 for each field (F,): what turns h and its isovalues so that the solid is upwards."""
     return np.array([1.0 if f.inside == "above" else -1.0 for f in scene.fields])
+
+
+def in_frame(scene: Scene, queries: Queries) -> tuple[Floats, Floats, Floats]:
+    """Points (n, 3) and normals (n, 3) of queries in the frame of the scene, and their levels (n, F) turned upward."""
+    axes = scene.fields[0].volume.direction
+    return scene.to_frame(queries.point), queries.normal @ axes, queries.level * upward(scene)

@@ -129,6 +129,20 @@ class Samples:
         return np.sqrt((self.stderr.astype(float) ** 2).mean(axis=1)).astype(np.float32)
 
 
+def check_request(paths: range, bounces: int) -> None:
+    """Refuse what no backend can answer.
+
+    Raises
+    ------
+    BadInput
+        On paths that do not count up by one, or bounces below 0.
+    """
+    if not isinstance(paths, range) or paths.step != 1 or paths.start < 0:
+        raise BadInput(f"paths is {paths!r}; expected a range of path numbers from 0 up with step 1, such as range(64)")
+    if bounces < 0:
+        raise BadInput(f"{bounces} bounces were asked for; expected 0 (light straight from the sky) or more")
+
+
 def combine(one: Samples, other: Samples) -> Samples:
     """Merge the answers of two disjoint ranges of paths to the same queries, as if independent.
 

@@ -162,7 +162,7 @@ class Scene:
             if names.count(name) > 1:
                 raise BadInput(f"two fields have the name {name!r}; expected names that differ")
         for other in fields[1:]:
-            if not np.allclose(other.volume.direction, fields[0].volume.direction, atol=1e-6):
+            if np.abs(other.volume.direction - fields[0].volume.direction).max() > 1e-6:
                 raise BadInput(
                     f"the axes of field {other.name!r} differ from those of {fields[0].name!r}; "
                     "expected one direction for all fields: resample one onto the lattice of the other"

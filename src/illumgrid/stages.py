@@ -3,14 +3,19 @@
 A stage is a frozen dataclass with a class attribute ``name``; its fields are its options.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import ClassVar, Literal, Protocol, runtime_checkable
 
+import numpy as np
+from numpy.typing import ArrayLike
+
+from illumgrid.errors import BadInput
 from illumgrid.grid import GridSpec, IlluminationGrid
+from illumgrid.levelset import isosurface
 from illumgrid.samples import Queries, Samples
 from illumgrid.scene import Scene
 
-__all__ = ["Backend", "GridSpec", "IlluminationGrid", "Interpolator", "Queries", "Sampler", "Samples"]
+__all__ = ["Backend", "GridSpec", "IlluminationGrid", "Interpolator", "Queries", "Sampler", "Samples", "on_level_sets"]
 
 
 @runtime_checkable
@@ -73,3 +78,53 @@ class Interpolator(Protocol):
         spec : GridSpec
         field : int
         """
+
+
+def on_level_sets(
+    scene: Scene,
+    levels: ArrayLike,
+    seed: int,
+    *,
+    specs: Sequence[GridSpec] | None = None,
+    points: int | None = None,
+) -> Iterator[Queries]:
+    """Queries on every field's level set of each row of `levels`, uniform by area, projected on the trilinear set.
+
+    Parameters
+    ----------
+    scene : Scene
+    levels : (K,) or (K, F) array_like
+        Isovalues of field 0 (the other fields follow the common sweep), or whole rows.
+    seed : int
+        Equal seeds give equal points.
+    specs : sequence of GridSpec, optional
+        One a field: their node spacing sets the default number of points; without it the voxel spacing does.
+    points : int, optional
+        Points on each level set; by default one for each squared spacing, at least 64.
+
+    Yields
+    ------
+    Queries
+        One batch for each row and field whose level set is not empty; ids count up within a field, over all rows.
+    """
+    rows = np.asarray(levels, dtype=float)
+    if rows.ndim == 1:
+        rows = scene.levels_through(0, rows)
+    if rows.ndim != 2 or rows.shape[1] != len(scene.fields) or not np.isfinite(rows).all():
+        raise BadInput(f"levels have shape {rows.shape}; expected (K,) or (K, {len(scene.fields)}) finite isovalues")
+    asked = np.zeros(len(scene.fields), dtype=np.int64)
+    for number, row in enumerate(rows):
+        for f, field in enumerate(scene.fields):
+            mesh = isosurface(field.volume, row[f], field.inside)
+            if not len(mesh.faces) or not mesh.area > 0:
+                continue
+            spacing = (field.volume if specs is None else specs[f]).spacing
+            count = points or max(64, round(mesh.area / float(np.prod(spacing) ** (2 / 3))))
+            random = np.random.default_rng((seed, number, f))
+            corners = mesh.triangles[random.choice(len(mesh.faces), count, p=mesh.area_faces / mesh.area)]
+            # Uniform in a triangle: Osada et al., "Shape distributions", ACM TOG 21(4), 2002.
+            root, share = np.sqrt(random.random((count, 1))), random.random((count, 1))
+            at = (1 - root) * corners[:, 0] + root * (1 - share) * corners[:, 1] + root * share * corners[:, 2]
+            queries = Queries.at(scene, at, field=f, level=row[f], first_id=(f << 40) + int(asked[f]))
+            asked[f] += count
+            yield Queries(queries.id, queries.point, queries.normal, np.tile(row, (count, 1)), queries.target)

@@ -167,12 +167,9 @@ def cells(volume: Volume, index: Floats) -> tuple[NDArray[np.int64], Floats]:
 
 def interpolate(volume: Volume, index: Floats) -> Floats:
     """Trilinear value (n,) at fractional indices (n, 3); beyond the border, that of the border."""
-    cell, f = cells(volume, index)
-    result = np.zeros(len(index))
-    for corner in np.ndindex(2, 2, 2):
-        weight = np.where(corner, f, 1 - f).prod(axis=1)
-        result += weight * volume.values[tuple((cell + corner).T)]
-    return result
+    from scipy.ndimage import map_coordinates
+
+    return np.asarray(map_coordinates(volume.values, index.T, output=np.float64, order=1, mode="nearest"))
 
 
 def cell_gradient(volume: Volume, index: Floats) -> Floats:

@@ -88,7 +88,7 @@ def next_root(q1, q2, q3, end):
     """
     a, b, c = q1 * end, q2 * end * end, q3 * end * end * end
     if a == 0.0:
-        if b > 0.0 or (b == 0.0 and c > 0.0):
+        if b > 0.0 or (b == 0.0 and c >= 0.0):  # all zero: the cell is flat, at the level, hence solid
             return 0.0
         return -b / c * end if c > 0.0 and -b <= c else np.inf
     if a > 0.0:
@@ -188,37 +188,29 @@ def march(scene, f, level, ux, uy, uz, dx, dy, dz, on_surface, limit):
     brick_x = brick_y * scene.brick_shape[f, 1]
     brick_start = scene.brick_start[f]
     # A plane at index coordinate p is met at t = p i + k; a ray parallel to it never does: i = 0, k = inf.
+    # Bricks and cells compute it alike, so that a brick's last cell ends exactly where the brick does.
     ix, kx = (1.0 / dx, -ux / dx) if dx != 0.0 else (0.0, np.inf)
     iy, ky = (1.0 / dy, -uy / dy) if dy != 0.0 else (0.0, np.inf)
     iz, kz = (1.0 / dz, -uz / dz) if dz != 0.0 else (0.0, np.inf)
     ahead_x, ahead_y, ahead_z = int(dx > 0.0), int(dy > 0.0), int(dz > 0.0)
+    toward_x, toward_y, toward_z = 2 * ahead_x - 1, 2 * ahead_y - 1, 2 * ahead_z - 1
+    bx, by, bz = cx >> BRICK_SHIFT, cy >> BRICK_SHIFT, cz >> BRICK_SHIFT
+    started = False
     while True:
-        bx, by, bz = cx >> BRICK_SHIFT, cy >> BRICK_SHIFT, cz >> BRICK_SHIFT
-        low_x, low_y, low_z = bx << BRICK_SHIFT, by << BRICK_SHIFT, bz << BRICK_SHIFT
-        high_x, high_y, high_z = min(low_x + 4, last_x), min(low_y + 4, last_y), min(low_z + 4, last_z)
-        if scene.bricks[brick_start + bx * brick_x + by * brick_y + bz] < level:
-            # Leave an empty brick in one step.
-            on_surface = False
-            tx = (high_x if ahead_x else low_x) * ix + kx
-            ty = (high_y if ahead_y else low_y) * iy + ky
-            tz = (high_z if ahead_z else low_z) * iz + kz
-            t = max(t, min(tx, ty, tz))
-            if t >= t_out:
-                return np.inf, MISS, -1
-            if tx <= ty and tx <= tz:
-                cx = high_x if ahead_x else low_x - 1
-                cy, cz = follow(uy, t, dy, low_y, high_y - 1), follow(uz, t, dz, low_z, high_z - 1)
-            elif ty <= tz:
-                cy = high_y if ahead_y else low_y - 1
-                cx, cz = follow(ux, t, dx, low_x, high_x - 1), follow(uz, t, dz, low_z, high_z - 1)
-            else:
-                cz = high_z if ahead_z else low_z - 1
-                cx, cy = follow(ux, t, dx, low_x, high_x - 1), follow(uy, t, dy, low_y, high_y - 1)
-        else:
-            # Go from cell to cell within a brick.
-            while low_x <= cx < high_x and low_y <= cy < high_y and low_z <= cz < high_z:
+        # The far planes of the brick; the last ones of the field are those of its border.
+        bound_x = min((bx + ahead_x) << BRICK_SHIFT, last_x) * ix + kx
+        bound_y = min((by + ahead_y) << BRICK_SHIFT, last_y) * iy + ky
+        bound_z = min((bz + ahead_z) << BRICK_SHIFT, last_z) * iz + kz
+        t_brick = min(bound_x, bound_y, bound_z)
+        if scene.bricks[brick_start + bx * brick_x + by * brick_y + bz] >= level:
+            if started:
+                cx = follow(ux, t, dx, bx << BRICK_SHIFT, min((bx + 1) << BRICK_SHIFT, last_x) - 1)
+                cy = follow(uy, t, dy, by << BRICK_SHIFT, min((by + 1) << BRICK_SHIFT, last_y) - 1)
+                cz = follow(uz, t, dz, bz << BRICK_SHIFT, min((bz + 1) << BRICK_SHIFT, last_z) - 1)
+            while True:
+                # Go from cell to cell.
                 tx, ty, tz = (cx + ahead_x) * ix + kx, (cy + ahead_y) * iy + ky, (cz + ahead_z) * iz + kz
-                t_next = max(t, min(tx, ty, tz))
+                t_cell = max(t, min(tx, ty, tz))
                 corner = start + cx * step_x + cy * step_y + cz
                 across = corner + step_x
                 v = scene.values
@@ -231,25 +223,31 @@ def march(scene, f, level, ux, uy, uz, dx, dy, dz, on_surface, limit):
                     ez = min(max(uz + t * dz - cz, 0.0), 1.0)
                     q0, q1, q2, q3 = cubic(v, corner, step_x, step_y, level, ex, ey, ez, dx, dy, dz)
                     if on_surface:
-                        root = next_root(q1, q2, q3, t_next - t)
+                        root = next_root(q1, q2, q3, t_cell - t)
                     elif q0 >= 0.0:
                         root = 0.0
                     else:
-                        root = first_root(q0, q1, q2, q3, t_next - t)
+                        root = first_root(q0, q1, q2, q3, t_cell - t)
                     if root < np.inf:
                         t += root
                         return (t, SURFACE, -1) if t < limit else (np.inf, MISS, -1)
                 on_surface = False
-                t = t_next
-                if tx <= ty and tx <= tz:
-                    cx += 2 * ahead_x - 1
-                elif ty <= tz:
-                    cy += 2 * ahead_y - 1
-                else:
-                    cz += 2 * ahead_z - 1
-                if t >= t_out:
-                    return np.inf, MISS, -1
-        if cx < 0 or cy < 0 or cz < 0 or cx >= last_x or cy >= last_y or cz >= last_z:
+                t = t_cell
+                if t >= t_brick:
+                    break
+                # Without branches: which plane comes first is a coin toss that no processor predicts.
+                by_x, by_y = tx <= ty and tx <= tz, ty < tx and ty <= tz
+                cx += toward_x if by_x else 0
+                cy += toward_y if by_y else 0
+                cz += 0 if by_x or by_y else toward_z
+        t, started, on_surface = max(t, t_brick), True, False
+        by_x, by_y = bound_x <= bound_y and bound_x <= bound_z, bound_y < bound_x and bound_y <= bound_z
+        bx += toward_x if by_x else 0
+        by += toward_y if by_y else 0
+        bz += 0 if by_x or by_y else toward_z
+        if t >= t_out or bx < 0 or by < 0 or bz < 0:
+            return np.inf, MISS, -1
+        if bx >= scene.brick_shape[f, 0] or by >= scene.brick_shape[f, 1] or bz >= scene.brick_shape[f, 2]:
             return np.inf, MISS, -1
 
 
@@ -265,8 +263,7 @@ def nearest_hit(scene, level, x, y, z, dx, dy, dz, on, on_cap):
             continue
         sx, sy, sz = scene.spacing[f, 0], scene.spacing[f, 1], scene.spacing[f, 2]
         ux, uy, uz = (x - scene.origin[f, 0]) / sx, (y - scene.origin[f, 1]) / sy, (z - scene.origin[f, 2]) / sz
-        if f == on:
-            ux, uy, uz = snap(ux), snap(uy), snap(uz)
+        ux, uy, uz = snap(ux), snap(uy), snap(uz)
         t, hit, side = march(scene, f, level[f], ux, uy, uz, dx / sx, dy / sy, dz / sz, f == on, best)
         if hit != MISS and t < best:
             best, field, what, face = t, f, hit, side
@@ -337,7 +334,7 @@ def cosine_direction(u1, u2, nx, ny, nz):
     """
     radius, angle = np.sqrt(u1), 2.0 * np.pi * u2
     x, y, z = radius * np.cos(angle), radius * np.sin(angle), np.sqrt(1.0 - u1)
-    sign = 1.0 if nz >= 0.0 else -1.0
+    sign = 1.0 if nz >= -1e-6 else -1.0  # 0 is common on voxel data and comes out as -1e-17 in a turned frame
     a = -1.0 / (sign + nz)
     b = nx * ny * a
     return (
@@ -348,25 +345,29 @@ def cosine_direction(u1, u2, nx, ny, nz):
 
 
 @jit
+def holds(scene, f, level, ux, uy, uz):
+    """Whether index u lies in the solid {v >= level} of field f, its border included."""
+    last_x, last_y, last_z = scene.shape[f, 0] - 1, scene.shape[f, 1] - 1, scene.shape[f, 2] - 1
+    if not (0.0 <= ux <= last_x and 0.0 <= uy <= last_y and 0.0 <= uz <= last_z):
+        return False
+    cx, cy, cz = min(int(ux), last_x - 1), min(int(uy), last_y - 1), min(int(uz), last_z - 1)
+    step_y = scene.shape[f, 2]
+    step_x = step_y * scene.shape[f, 1]
+    corner = scene.start[f] + cx * step_x + cy * step_y + cz
+    q0, _, _, _ = cubic(scene.values, corner, step_x, step_y, level, ux - cx, uy - cy, uz - cz, 0.0, 0.0, 0.0)
+    return q0 >= 0.0
+
+
+@jit
 def buried(scene, level, x, y, z, own):
     """Whether the frame point x lies inside the solid of a field other than `own`."""
     for f in range(scene.start.shape[0]):
         if f == own:
             continue
-        _, what, _ = march(
-            scene,
-            f,
-            level[f],
-            (x - scene.origin[f, 0]) / scene.spacing[f, 0],
-            (y - scene.origin[f, 1]) / scene.spacing[f, 1],
-            (z - scene.origin[f, 2]) / scene.spacing[f, 2],
-            1.0,
-            0.0,
-            0.0,
-            False,
-            1e-300,
-        )
-        if what == BURIED:
+        ux = snap((x - scene.origin[f, 0]) / scene.spacing[f, 0])
+        uy = snap((y - scene.origin[f, 1]) / scene.spacing[f, 1])
+        uz = snap((z - scene.origin[f, 2]) / scene.spacing[f, 2])
+        if holds(scene, f, level[f], ux, uy, uz):
             return True
     return False
 

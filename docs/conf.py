@@ -1,0 +1,47 @@
+"""How the pages are built: ``sphinx-build -W -b html docs docs/_build/html``."""
+
+from importlib.metadata import version as installed
+
+project = "illumgrid"
+author = "The illumgrid authors"
+copyright = "2026, The illumgrid authors"
+version = release = installed("illumgrid")
+
+extensions = [
+    "sphinx.ext.autodoc",
+    "sphinx.ext.autosummary",
+    "numpydoc",
+    "myst_parser",
+    "sphinx_gallery.gen_gallery",
+]
+templates_path = ["_templates"]
+exclude_patterns = ["_build", "examples"]
+
+myst_enable_extensions = ["dollarmath", "amsmath", "deflist"]
+myst_heading_anchors = 3
+
+autosummary_generate = True
+autodoc_typehints = "none"  # the numpydoc sections say the types, with shapes and units
+autodoc_member_order = "bysource"
+numpydoc_show_class_members = False
+
+sphinx_gallery_conf = {
+    "examples_dirs": "examples",
+    "gallery_dirs": "gallery",
+    "abort_on_example_error": True,
+    "download_all_examples": False,
+    "show_signature": False,
+    "write_computation_times": False,
+    "min_reported_time": 1e9,
+    "capture_repr": (),
+}
+
+html_theme = "pydata_sphinx_theme"
+html_title = "illumgrid"
+html_show_sourcelink = False
+html_theme_options = {
+    "navigation_with_keys": False,
+    "secondary_sidebar_items": ["page-toc"],
+    "footer_start": ["copyright"],
+    "footer_end": [],
+}

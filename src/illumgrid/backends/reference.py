@@ -1,0 +1,275 @@
+"""The same paths in pure NumPy, written to be read: all rays of a batch take each step together.
+
+The path loop has the headings of `kernels.walk`; everything that Numba's kernels do for speed is left out.
+"""
+
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from illumgrid.levelset import Marchable, in_frame, marchable
+from illumgrid.rng import draw, stream
+from illumgrid.samples import Queries, Samples, check_request
+from illumgrid.scene import Scene
+from illumgrid.volume import ON_A_VOXEL, Floats
+
+Bools = NDArray[np.bool_]
+Ints = NDArray[np.int64]
+
+MISS, SURFACE, CAP, BURIED = 0, 1, 2, 3
+_CORNERS = np.array(list(np.ndindex(2, 2, 2)))
+
+
+def voxels(scene: Marchable, f: int) -> NDArray[np.float32]:
+    """The values of field f, turned so that its solid is {v >= level}, axes x, y, z."""
+    nx, ny, nz = scene.shape[f]
+    return scene.values[scene.start[f] : scene.start[f] + nx * ny * nz].reshape(nx, ny, nz)
+
+
+def index_of(scene: Marchable, f: int, x: Floats) -> Floats:
+    """Index coordinates (n, 3) of frame points, on a plane of voxels where they nearly are."""
+    u = (x - scene.origin[f]) / scene.spacing[f]
+    nearest = np.round(u)
+    return np.where(np.abs(u - nearest) < ON_A_VOXEL, nearest, u)
+
+
+def cubic(v: NDArray[np.float32], level: Floats, cell: Ints, e: Floats, d: Floats) -> Floats:
+    """Coefficients (n, 4) of v - level along e + t d in local cell coordinates: three blends, each one degree higher."""
+    corners = v[tuple((cell[:, None, :] + _CORNERS).transpose(2, 0, 1))].astype(float) - level[:, None]
+    q = corners.reshape(-1, 2, 2, 2, 1)
+    for axis in range(3):
+        low, rise = q[:, 0], q[:, 1] - q[:, 0]
+        shape = (-1,) + (1,) * (rise.ndim - 1)
+        q = np.zeros((*low.shape[:-1], low.shape[-1] + 1))
+        q[..., :-1] = low + rise * e[:, axis].reshape(shape)
+        q[..., 1:] += rise * d[:, axis].reshape(shape)
+    return q
+
+
+def evaluate(q: Floats, t: Floats) -> Floats:
+    """Value (n,) of the polynomials q (n, degree + 1) at t (n,)."""
+    total = np.zeros(len(q))
+    for k in range(q.shape[1] - 1, -1, -1):
+        total = total * t + q[:, k]
+    return total
+
+
+def first_rise(q: Floats, end: Floats) -> Floats:
+    """Smallest t (n,) in [0, end] at which the cubics q (n, 4), below 0 at 0, reach 0; inf if none.
+
+    The roots of the derivative part the interval into monotone pieces; the first piece that ends at or above 0 is halved.
+    """
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        a, b, c = q[:, 1], q[:, 2], q[:, 3]
+        w = -(b + np.copysign(np.sqrt(b * b - 3 * a * c), b))
+        stationary = np.sort(np.stack([w / (3 * c), a / w]), axis=0)
+    knots = np.stack([np.zeros(len(q)), *np.where((stationary > 0) & (stationary < end), stationary, 0.0), end])
+    knots = np.maximum.accumulate(knots, axis=0)
+    left, right, found = np.zeros(len(q)), np.zeros(len(q)), np.zeros(len(q), bool)
+    for low, high in zip(knots[:-1], knots[1:]):
+        here = ~found & (evaluate(q, high) >= 0)
+        left, right = np.where(here, low, left), np.where(here, high, right)
+        found |= here
+    for _ in range(60):
+        middle = 0.5 * (left + right)
+        above = evaluate(q, middle) >= 0
+        left, right = np.where(above, left, middle), np.where(above, middle, right)
+    return np.where(found, right, np.inf)
+
+
+def rise_from_surface(q: Floats, end: Floats) -> Floats:
+    """The same for rays that start on the level set: the constant term is 0, and its root t = 0 is divided out."""
+    rest = q[:, 1:].copy()
+    for _ in range(2):  # zeros at the front are further roots at t = 0
+        flat = rest[:, 0] == 0
+        rest[flat] = np.roll(rest[flat], -1, axis=1)
+    dips = rest[:, 0] > 0
+    flat = ~rest.any(axis=1)  # a cell that is flat at the level is solid
+    t = first_rise(np.pad(rest, ((0, 0), (0, 1))), end)
+    return np.where(dips | flat, 0.0, t)
+
+
+def march(v: NDArray[np.float32], level: Floats, u: Floats, d: Floats, on_surface: Bools) -> tuple[Floats, Ints, Ints]:
+    """First meeting of rays u + t d, in index coordinates, with the solid {v >= level}: (t, what, axis of a cap), each (n,)."""
+    n, last = len(u), np.array(v.shape) - 1
+    t_hit, what, face = np.full(n, np.inf), np.full(n, MISS), np.full(n, -1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        to_low, to_high = -u / d, (last - u) / d
+    still, within = d == 0, (u >= 0) & (u <= last)
+    near = np.where(still, np.where(within, -np.inf, np.inf), np.minimum(to_low, to_high))
+    far = np.where(still, np.where(within, np.inf, -np.inf), np.maximum(to_low, to_high))
+    t = np.maximum(near.max(axis=1), 0.0)
+    entered = near.max(axis=1) > 0
+    entry_axis = np.where(entered, near.argmax(axis=1), -1)
+
+    # The cell that the ray enters; on a plane of voxels the direction decides.
+    with np.errstate(invalid="ignore"):
+        p = np.clip(u + np.where(np.isfinite(t), t, 0.0)[:, None] * d, 0.0, last)
+    at_face = entry_axis[:, None] == np.arange(3)
+    p = np.where(at_face, np.where(d > 0, 0.0, last), p)
+    cell = np.floor(p).astype(np.int64)
+    cell -= (p == cell) & ((d < 0) | (still & (cell == last)))
+    ray = np.flatnonzero((t <= far.min(axis=1)) & ((cell >= 0) & (cell < last)).all(axis=1))
+
+    # A ray that comes from outside and starts in the solid meets a cap, or is buried.
+    solid = ray[(evaluate(cubic(v, level[ray], cell[ray], p[ray] - cell[ray], d[ray]), np.zeros(len(ray))) >= 0)]
+    solid = solid[~on_surface[solid]]
+    t_hit[solid], what[solid], face[solid] = t[solid], np.where(entered[solid], CAP, BURIED), entry_axis[solid]
+    ray = np.setdiff1d(ray, solid)
+
+    # From cell to cell, all rays together.
+    own = on_surface.copy()
+    while len(ray):
+        c, r = cell[ray], d[ray]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            planes = np.where(r == 0, np.inf, (c + (r > 0)) * (1 / r) - u[ray] / r)
+        t_next = np.maximum(t[ray], planes.min(axis=1))
+        q = cubic(v, level[ray], c, np.clip(u[ray] + t[ray, None] * r - c, 0.0, 1.0), r)
+        length = t_next - t[ray]
+        root = np.where(q[:, 0] >= 0, 0.0, first_rise(q, length))
+        if own[ray].any():
+            root[own[ray]] = rise_from_surface(q[own[ray]], length[own[ray]])
+        own[ray] = False
+        hit = np.isfinite(root)
+        t_hit[ray[hit]], what[ray[hit]] = t[ray[hit]] + root[hit], SURFACE
+        axis = planes.argmin(axis=1)
+        c[np.arange(len(c)), axis] += np.where(r[np.arange(len(c)), axis] > 0, 1, -1)
+        cell[ray], t[ray] = c, t_next
+        ray = ray[~hit & ((c >= 0) & (c < last)).all(axis=1)]
+    return t_hit, what, face
+
+
+def nearest_hit(
+    scene: Marchable, level: Floats, x: Floats, d: Floats, on: Ints, on_cap: Bools
+) -> tuple[Floats, Ints, Ints, Ints]:
+    """First surface of any field along the frame rays x + t d: (t, field, what, axis of a cap), each (n,)."""
+    n = len(x)
+    best, field, what, face = np.full(n, np.inf), np.full(n, -1), np.full(n, MISS), np.full(n, -1)
+    for f in range(len(scene.start)):
+        ray = np.flatnonzero(~((on == f) & on_cap))  # from a cap, the convex box cannot be met again
+        start = index_of(scene, f, x[ray])
+        t, hit, axis = march(voxels(scene, f), level[ray, f], start, d[ray] / scene.spacing[f], on[ray] == f)
+        closer = (hit != MISS) & (t < best[ray])
+        ray = ray[closer]
+        best[ray], field[ray], what[ray], face[ray] = t[closer], f, hit[closer], axis[closer]
+    return best, field, what, face
+
+
+def gradient_normal(scene: Marchable, f: int, x: Floats) -> Floats:
+    """Outward unit normals (n, 3) at frame points: central differences, interpolated; of the cell where they cancel."""
+    v, last = voxels(scene, f), scene.shape[f] - 1
+    u = (x - scene.origin[f]) / scene.spacing[f]
+    cell = np.clip(np.floor(u), 0, last - 1).astype(np.int64)
+    e = np.clip(u - cell, 0.0, 1.0)
+    gradient = np.zeros((len(x), 3))
+    for corner in _CORNERS:
+        weight = np.where(corner, e, 1 - e).prod(axis=1)
+        for axis in range(3):
+            after, before = cell + corner, cell + corner
+            after[:, axis] = np.minimum(after[:, axis] + 1, last[axis])
+            before[:, axis] = np.maximum(before[:, axis] - 1, 0)
+            rise = v[tuple(after.T)].astype(float) - v[tuple(before.T)]
+            gradient[:, axis] += weight * rise / (after - before)[:, axis]
+    flat = ~gradient.any(axis=1)
+    for axis in range(3):
+        step = np.tile(np.eye(3)[axis], (int(flat.sum()), 1))
+        gradient[flat, axis] = cubic(v, np.zeros(len(step)), cell[flat], e[flat], step)[:, 1]
+    gradient /= scene.spacing[f]
+    largest = np.abs(gradient).max(axis=1, keepdims=True, initial=0.0)
+    gradient = gradient / np.where(largest > 0, largest, 1.0)
+    length = np.linalg.norm(gradient, axis=1, keepdims=True)
+    return -gradient / np.where(length > 0, length, 1.0)
+
+
+def cosine_direction(u1: Floats, u2: Floats, normal: Floats) -> Floats:
+    """Directions (n, 3) of density cosine / π about the normals; the frame by Duff et al., JCGT 6(1), 2017."""
+    radius, angle = np.sqrt(u1), 2 * np.pi * u2
+    nx, ny, nz = normal.T
+    sign = np.where(nz >= -1e-6, 1.0, -1.0)
+    a = -1 / (sign + nz)
+    b = nx * ny * a
+    tangent = np.stack([1 + sign * nx * nx * a, sign * b, -sign * nx], axis=1)
+    bitangent = np.stack([b, sign + ny * ny * a, -ny], axis=1)
+    local = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.sqrt(1 - u1)])[:, :, None]
+    return local[0] * tangent + local[1] * bitangent + local[2] * normal
+
+
+def walk(
+    scene: Marchable, key: NDArray[np.uint64], path: int, bounces: int, level: Floats, own: Ints, x: Floats, normal: Floats
+) -> Floats:
+    """Worth (n, 3) of one path from each point on a level set: the irradiance is π times the mean."""
+    worth, keep = np.zeros((len(x), 3)), np.ones((len(x), 3))  # keep: share of the light that comes back along the path
+    x, normal, on, on_cap = x.copy(), normal.copy(), own.astype(np.int64), np.zeros(len(x), bool)
+    alive = np.arange(len(x))
+    for segment in range(bounces + 1):
+        # Choose a direction by the cosine about the gradient normal.
+        u1 = draw(key[alive], np.uint64(path), np.uint64(2 * segment))
+        u2 = draw(key[alive], np.uint64(path), np.uint64(2 * segment + 1))
+        d = cosine_direction(u1, u2, normal[alive])
+
+        # Follow the ray to the nearest surface; one that dips under its own has hit it already.
+        t, field, what, face = nearest_hit(scene, level[alive], x[alive], d, on[alive], on_cap[alive])
+
+        # A path that escapes sees the background, and ends.
+        escaped = alive[what == MISS]
+        worth[escaped] += keep[escaped] * scene.background
+
+        # A path inside a solid carries no light.
+        goes_on = (what == SURFACE) | (what == CAP)
+        alive, t, d, field, what, face = (array[goes_on] for array in (alive, t, d, field, what, face))
+
+        # Account for what the surface emits.
+        worth[alive] += keep[alive] * scene.emission[field]
+
+        # Reflect: the albedo takes its share, and the path goes on from the hit.
+        keep[alive] *= scene.albedo[field]
+        on[alive], on_cap[alive] = field, what == CAP
+        moved = t > 0
+        x[alive] += np.where(moved, t, 0.0)[:, None] * d
+        for f in range(len(scene.start)):
+            here = moved & (field == f) & (what == SURFACE)
+            normal[alive[here]] = gradient_normal(scene, f, x[alive[here]])
+        cap = moved & (what == CAP)
+        normal[alive[cap]] = -np.sign(d[cap]) * (face[cap, None] == np.arange(3))
+        alive = alive[normal[alive].any(axis=1)]
+    return worth
+
+
+def holes(scene: Marchable, level: Floats, x: Floats, normal: Floats, target: Ints) -> Bools:
+    """Queries (n,) without a normal, or inside the solid of a field that is not their own."""
+    bad = ~normal.any(axis=1)
+    for f in range(len(scene.start)):
+        u, last = index_of(scene, f, x), scene.shape[f] - 1
+        cell = np.clip(np.floor(u), 0, last - 1).astype(np.int64)
+        q = cubic(voxels(scene, f), level[:, f], cell, u - cell, np.zeros_like(u))
+        bad |= (target != f) & ((u >= 0) & (u <= last)).all(axis=1) & (q[:, 0] >= 0)
+    return bad
+
+
+@dataclass(frozen=True)
+class Reference:
+    """The same paths as `numba`, in pure NumPy: slow, and easy to check."""
+
+    name: ClassVar[str] = "reference"
+    geometry: ClassVar[Literal["mesh", "levelset", "both"]] = "levelset"
+
+    def solve(self, scene: Scene, queries: Queries, *, paths: range, bounces: int, seed: int) -> Samples:
+        """Trace paths from every query: see `illumgrid.stages.Backend`."""
+        check_request(paths, bounces)
+        fields = marchable(scene)
+        point, normal, level = in_frame(scene, queries)
+        mean, m2 = np.zeros((len(queries), 3)), np.zeros((len(queries), 3))
+        good = ~holes(fields, level, point, normal, queries.target.astype(np.int64))
+        with np.errstate(over="ignore"):  # the random numbers wrap around, on purpose
+            key = stream(np.uint64(seed), queries.id[good])
+            for n, path in enumerate(paths):
+                worth = walk(
+                    fields, key, path, bounces, level[good], queries.target[good].astype(np.int64), point[good], normal[good]
+                )
+                off = np.pi * worth - mean[good]
+                mean[good] += off / (n + 1)
+                m2[good] += off * (np.pi * worth - mean[good])
+        count = np.where(good, len(paths), 0).astype(np.int32)
+        return Samples(queries, mean.astype(np.float32), m2.astype(np.float32), count)

@@ -1,0 +1,122 @@
+"""The chain: ask, answer, fill. No disk, no names of stages, no screen."""
+
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Protocol
+
+import numpy as np
+
+from illumgrid.grid import GridSpec, IlluminationGrid
+from illumgrid.samples import Queries, Samples, join_samples
+from illumgrid.scene import Scene
+from illumgrid.stages import Backend, Interpolator, Sampler
+from illumgrid.volume import interpolate, world_to_index
+
+Progress = Callable[[str, int, int], None]
+"""Called with what is being done, how much of it is done, and how much there is."""
+
+
+class Map(Protocol):
+    """Like the built-in ``map``: results in the order of the work. An executor's ``map`` will do."""
+
+    def __call__(self, function: Callable[[Any], Any], work: Iterable[Any], /) -> Iterable[Any]: ...
+
+
+@dataclass(frozen=True, eq=False)
+class Baked:
+    """Light for every field, and how it came about.
+
+    Parameters
+    ----------
+    grids : tuple of IlluminationGrid
+        One a field.
+    seconds : dict
+        Wall time of each stage.
+    queries : int
+        Number of questions asked.
+    holes : tuple of int
+        For each field, nodes within its range that no sample supports.
+    """
+
+    grids: tuple[IlluminationGrid, ...]
+    seconds: dict[str, float]
+    queries: int
+    holes: tuple[int, ...]
+
+
+def _answer(scene: Scene, backend: Backend, paths: range, bounces: int, seed: int, queries: Queries) -> Samples:
+    return backend.solve(scene, queries, paths=paths, bounces=bounces, seed=seed)
+
+
+def holes_within_range(scene: Scene, field: int, grid: IlluminationGrid) -> int:
+    """Nodes without support through which an isosurface of the range passes."""
+    empty = np.flatnonzero(grid.support == 0)
+    own = scene.fields[field]
+    level = interpolate(own.volume, world_to_index(own.volume, grid.spec.nodes(empty)))
+    return int(((level >= own.range[0]) & (level <= own.range[1])).sum())
+
+
+def bake(
+    scene: Scene,
+    specs: Sequence[GridSpec],
+    sampler: Sampler,
+    backend: Backend,
+    interpolator: Interpolator,
+    *,
+    paths: range,
+    bounces: int,
+    seed: int = 0,
+    map: Map = map,
+    progress: Progress = lambda what, done, total: None,
+) -> Baked:
+    """Compute the illumination grids of a scene.
+
+    Parameters
+    ----------
+    scene : Scene
+    specs : sequence of GridSpec
+        The nodes, one lattice a field.
+    sampler, backend, interpolator
+        Stage objects.
+    paths : range
+        Numbers of the paths from every query.
+    bounces : int
+    seed : int
+    map : callable, optional
+        What spreads the batches: the built-in ``map``, or that of an executor or cluster.
+    progress : callable, optional
+        Told (what, done, total).
+    """
+    clock = [time.perf_counter()]
+    batches = [batch for batch in sampler.queries(scene, specs, seed) if len(batch)]
+    clock.append(time.perf_counter())
+
+    total, done = sum(len(batch) for batch in batches), 0
+    answers: list[Samples] = []
+    progress("light", 0, total)
+    for answer in map(partial(_answer, scene, backend, paths, bounces, seed), batches):
+        answers.append(answer)
+        done += len(answer)
+        progress("light", done, total)
+    clock.append(time.perf_counter())
+
+    grids = []
+    for number, spec in enumerate(specs):
+        own = [a[a.queries.target == number] for a in answers if (a.queries.target == number).any()]
+        samples = join_samples(own) if own else _no_samples(scene)
+        grids.append(interpolator.fill(samples, spec, number))
+        progress("grid", number + 1, len(specs))
+    clock.append(time.perf_counter())
+    return Baked(
+        grids=tuple(grids),
+        seconds=dict(zip(("sampler", "backend", "interpolator"), np.diff(clock).tolist())),
+        queries=total,
+        holes=tuple(holes_within_range(scene, n, grid) for n, grid in enumerate(grids)),
+    )
+
+
+def _no_samples(scene: Scene) -> Samples:
+    rgb = np.zeros((0, 3), np.float32)
+    return Samples(Queries.at(scene, np.zeros((0, 3))), rgb, rgb, np.zeros(0, np.int32))

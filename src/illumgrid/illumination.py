@@ -1,0 +1,208 @@
+"""The result, and the way to it: where names of stages become objects."""
+
+import os
+import warnings
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from functools import cached_property
+from importlib.metadata import version
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from illumgrid import preview, registry, store, tone
+from illumgrid.bake import Map, Progress, bake
+from illumgrid.errors import BadInput, IllumgridWarning
+from illumgrid.grid import GridSpec, IlluminationGrid
+from illumgrid.scene import Levels, Scene, level_table
+from illumgrid.stages import Backend, Interpolator, Sampler
+
+LONGEST = 128
+"""Nodes along the longest axis, at most, when nothing else is asked for."""
+
+
+@dataclass(frozen=True, eq=False)
+class Illumination:
+    """Light for every isosurface of a scene.
+
+    Parameters
+    ----------
+    scene : Scene
+        With the fields as used.
+    levels : Levels
+        The table of isovalues.
+    grids : tuple of IlluminationGrid
+        One a field.
+    recipe : mapping
+        How it was computed: stages, paths, seconds, versions; all of it JSON.
+    """
+
+    scene: Scene
+    levels: Levels
+    grids: tuple[IlluminationGrid, ...]
+    recipe: Mapping[str, Any]
+
+    def grid(self, field: str) -> IlluminationGrid:
+        """Illumination grid of the field with this name."""
+        return self.grids[self.scene.number_of(field)]
+
+    @cached_property
+    def exposure(self) -> float:
+        """Automatic exposure: one for all isovalues, views and fields, from the light that the grids hold."""
+        shown = [
+            grid.values[grid.support > 0] * (field.material.albedo / np.pi).astype(np.float32)
+            for field, grid in zip(self.scene.fields, self.grids)
+        ]
+        return tone.automatic_exposure(np.concatenate(shown))
+
+    def color(self, points: ArrayLike, field: str | None = None, exposure: float | None = None) -> NDArray[np.uint8]:
+        """Display colour of the isosurface at world points.
+
+        Parameters
+        ----------
+        points : (n, 3) array_like
+        field : str, optional
+            Name of the field that the surface belongs to; by default the first.
+        exposure : float, optional
+            By default the automatic one.
+
+        Returns
+        -------
+        (n, 3) uint8
+            sRGB of albedo/π · E · exposure.
+        """
+        number = 0 if field is None else self.scene.number_of(field)
+        radiance = self.grids[number].lookup(points) * self.scene.fields[number].material.albedo / np.pi
+        return tone.encode_srgb(radiance * (self.exposure if exposure is None else exposure))
+
+    def save(self, folder: str | os.PathLike[str], *, preview: bool = True, overwrite: bool = False) -> None:
+        """Write a folder that holds everything: see `illumgrid.load`.
+
+        Raises
+        ------
+        BadInput
+            If the folder holds a finished run and not `overwrite`, or anything that is not ours.
+        """
+        store.claim(folder, overwrite)
+        picture = _preview_png(self) if preview else None
+        recipe = {**self.recipe, "exposure": self.exposure}
+        store.write(folder, store.Stored(self.scene, self.levels, self.grids, recipe), picture, overwrite)
+
+
+def _preview_png(light: Illumination) -> bytes:
+    return preview.png(preview.render(light))
+
+
+def load(folder: str | os.PathLike[str]) -> Illumination:
+    """Read what `Illumination.save` or ``illumgrid run`` wrote."""
+    stored = store.read(folder)
+    return Illumination(stored.scene, stored.levels, stored.grids, stored.recipe)
+
+
+def _stage(kind: str, given: Any, options: dict[str, Any] | None = None) -> Any:
+    return registry.make(kind, given, options or {}) if isinstance(given, str) else given
+
+
+def _described(stage: Any) -> dict[str, Any]:
+    return {"name": stage.name, **asdict(stage)}
+
+
+def run(
+    scene: Scene,
+    *,
+    sampler: str | Sampler = "direct",
+    backend: str | Backend = "auto",
+    interpolator: str | Interpolator = "nearest",
+    grid: int | None = None,
+    paths: int = 64,
+    bounces: int = 4,
+    isovalues: int | None = None,
+    seed: int = 0,
+    map: Map = map,
+    progress: Progress = lambda what, done, total: None,
+) -> Illumination:
+    """Light a scene: one illumination grid for each field.
+
+    Parameters
+    ----------
+    scene : Scene
+    sampler, backend, interpolator : str or stage
+        Names, or stage objects such as ``illumgrid.sampler("uniform", count=64)``.
+    grid : int, optional
+        Nodes along the axis with most voxels; by default as many as voxels, at most 128.
+    paths : int
+        Light paths from every query.
+    bounces : int
+        Reflections; 0 is light straight from the sky.
+    isovalues : int, optional
+        Rows of the level table, 32 by default; if given, also the count of a sampler that is named and has one.
+    seed : int
+        Equal seeds give bit-identical grids, on any number of threads.
+    map : callable, optional
+        What spreads the work: see `illumgrid.bake.bake`.
+    progress : callable, optional
+        Told (what, done, total).
+
+    Returns
+    -------
+    Illumination
+
+    Raises
+    ------
+    BadInput
+        On options out of range, or unknown names.
+
+    Warns
+    -----
+    IllumgridWarning
+        When nodes within the range are holes.
+    """
+    if paths < 1:
+        raise BadInput(f"{paths} paths were asked for; expected at least 1")
+    if bounces < 0:
+        raise BadInput(f"{bounces} bounces were asked for; expected 0 (light straight from the sky) or more")
+    if not 0 <= seed < 2**64:
+        raise BadInput(f"the seed is {seed}; expected a whole number from 0 to 2**64 - 1")
+    levels = level_table(scene, 32 if isovalues is None else isovalues)
+    options = {}
+    if isovalues is not None and isinstance(sampler, str):
+        if "count" in {f.name for f in fields(registry.stage_class("sampler", sampler))}:
+            options["count"] = isovalues
+    chosen = _stage("sampler", sampler, options), _stage("backend", backend), _stage("interpolator", interpolator)
+    specs = [
+        GridSpec.over(f.volume, min(max(f.volume.shape), LONGEST) if grid is None else grid) for f in scene.fields
+    ]
+    baked = bake(scene, specs, *chosen, paths=range(paths), bounces=bounces, seed=seed, map=map, progress=progress)
+    for field, holes in zip(scene.fields, baked.holes):
+        if holes:
+            warnings.warn(
+                f"{holes} nodes within the range of field {field.name!r} got no light of their own (no normal, no sample "
+                "in reach, or inside another solid); they show that of the nearest node",
+                IllumgridWarning,
+                stacklevel=2,
+            )
+    recipe = {
+        **{kind: _described(stage) for kind, stage in zip(("sampler", "backend", "interpolator"), chosen)},
+        "grid": max(max(spec.shape) for spec in specs),
+        "paths": paths,
+        "bounces": bounces,
+        "isovalues": len(levels.table),
+        "seed": seed,
+        "queries": baked.queries,
+        "holes": list(baked.holes),
+        "seconds": {stage: round(seconds, 3) for stage, seconds in baked.seconds.items()},
+        "relative_error": _relative_error(baked.grids),
+        "versions": {name: version(name) for name in ("illumgrid", "numpy", "numba", "scipy")},
+    }
+    return Illumination(scene, levels, baked.grids, recipe)
+
+
+def _relative_error(grids: tuple[IlluminationGrid, ...]) -> list[float | None]:
+    """For each grid, the median over its nodes of the standard error, divided by the mean irradiance; None below two paths."""
+    result: list[float | None] = []
+    for grid in grids:
+        known = np.isfinite(grid.error) & (grid.support > 0)
+        mean = float(grid.values[known].mean()) if known.any() else 0.0
+        result.append(float(np.median(grid.error[known])) / mean if mean > 0 else None)
+    return result

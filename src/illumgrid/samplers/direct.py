@@ -1,0 +1,64 @@
+"""One question at each node: light decoupled from the extraction of surfaces.
+
+Banks and Beason, "Decoupling illumination from isosurface generation using 4D light transport", TVCG 2009.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from illumgrid.grid import GridSpec
+from illumgrid.samples import Queries
+from illumgrid.scene import Field, Scene
+
+_BATCH = 1 << 14
+
+
+def _pairwise(values: NDArray[np.float32], extreme: np.ufunc) -> NDArray[np.float32]:
+    """Extreme over the 8 corners of every cell."""
+    for axis in range(3):
+        line = np.moveaxis(values, axis, 0)
+        values = np.moveaxis(extreme(line[1:], line[:-1]), 0, axis)
+    return values
+
+
+def reachable(field: Field, spec: GridSpec) -> NDArray[np.int64]:
+    """Flat numbers of the nodes that a lookup on some isosurface of the field's range can touch.
+
+    They are the corners of all grid cells that overlap a voxel cell which some level set within the range crosses.
+    """
+    volume = field.volume
+    crossed = _pairwise(volume.values, np.maximum) >= field.range[0]
+    crossed &= _pairwise(volume.values, np.minimum) <= field.range[1]
+    for axis in range(3):
+        line = np.moveaxis(crossed, axis, 0)
+        voxel_cells, grid_cells = len(line), spec.shape[axis] - 1
+        first = np.arange(grid_cells) * voxel_cells // grid_cells
+        last = -(-(np.arange(grid_cells) + 1) * voxel_cells // grid_cells)
+        touched = [line[a:b].any(axis=0) for a, b in zip(first, last)]
+        crossed = np.moveaxis(np.stack(touched), 0, axis)
+    nodes = np.zeros(spec.shape, bool)
+    for corner in np.ndindex(2, 2, 2):
+        nodes[tuple(slice(c, c + n) for c, n in zip(corner, crossed.shape))] |= crossed
+    return np.flatnonzero(nodes)
+
+
+@dataclass(frozen=True)
+class Direct:
+    """One query on each grid node that a sweep can reach, on the level set through the node itself."""
+
+    name: ClassVar[str] = "direct"
+
+    def queries(self, scene: Scene, specs: Sequence[GridSpec], seed: int) -> Iterator[Queries]:
+        """Ask at the nodes, each with its flat number as id: see `illumgrid.stages.Sampler`."""
+        for number, (field, spec) in enumerate(zip(scene.fields, specs)):
+            nodes = reachable(field, spec)
+            for first in range(0, len(nodes), _BATCH):
+                batch = nodes[first : first + _BATCH]
+                asked = Queries.at(scene, spec.nodes(batch), field=number)
+                yield Queries(
+                    batch.astype(np.uint64) | np.uint64(number << 40), asked.point, asked.normal, asked.level, asked.target
+                )

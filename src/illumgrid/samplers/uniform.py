@@ -1,0 +1,39 @@
+"""Isovalues in equal steps, and points strewn over each level set: the paper's way."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+from illumgrid.errors import BadInput
+from illumgrid.grid import GridSpec
+from illumgrid.samples import Queries
+from illumgrid.scene import Scene, level_table
+from illumgrid.stages import on_level_sets
+
+
+@dataclass(frozen=True)
+class Uniform:
+    """Level sets in equal steps of the isovalue, points uniform by area on each.
+
+    Parameters
+    ----------
+    count : int
+        Number of isovalues, both ends of the range included.
+    points : int
+        Points on each level set; 0 takes one for each squared node spacing, at least 64.
+    """
+
+    name: ClassVar[str] = "uniform"
+    count: int = 32
+    points: int = 0
+
+    def __post_init__(self) -> None:
+        if self.count < 2:
+            raise BadInput(f"uniform.count is {self.count}; expected at least 2 isovalues")
+        if self.points < 0:
+            raise BadInput(f"uniform.points is {self.points}; expected a positive number, or 0 for one a node spacing squared")
+
+    def queries(self, scene: Scene, specs: Sequence[GridSpec], seed: int) -> Iterator[Queries]:
+        """Ask on `count` rows of the common sweep: see `illumgrid.stages.Sampler`."""
+        rows = level_table(scene, self.count).table
+        yield from on_level_sets(scene, rows, seed, specs=specs, points=self.points or None)

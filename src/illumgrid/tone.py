@@ -1,0 +1,27 @@
+"""From linear light to what a screen shows: the only place where light is clamped."""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+WHITE = 0.8
+"""Display radiance that automatic exposure gives to the brightest surfaces; sRGB 0.91, short of clipping."""
+
+
+def luminance(rgb: ArrayLike) -> NDArray[np.floating]:
+    """Relative luminance (...) of linear RGB (..., 3), Rec. 709."""
+    return np.asarray(rgb) @ np.array([0.2126, 0.7152, 0.0722], dtype=np.float32)
+
+
+def automatic_exposure(radiance: NDArray[np.floating]) -> float:
+    """Factor that brings the 98th percentile of the luminance of (n, 3) radiances to `WHITE`; 1 where all is dark."""
+    if not len(radiance):
+        return 1.0
+    bright = float(np.quantile(luminance(radiance), 0.98))
+    return WHITE / bright if bright > 0 and np.isfinite(bright) else 1.0
+
+
+def encode_srgb(linear: NDArray[np.floating]) -> NDArray[np.uint8]:
+    """Eight-bit sRGB of linear display values, clamped to 0 .. 1 (IEC 61966-2-1)."""
+    c = np.clip(linear, 0.0, 1.0)
+    curve = np.where(c <= 0.0031308, 12.92 * c, 1.055 * np.power(np.maximum(c, 1e-9), 1 / 2.4) - 0.055)
+    return np.round(255.0 * curve).astype(np.uint8)

@@ -1,0 +1,367 @@
+"""Light transport by plain loops: the oracle that every backend is compared with, path by path.
+
+Written from the specification alone, one ray and one cell at a time, to be obviously right rather than fast: cells come
+from sorting all crossings of the ray with the planes of the lattice, roots from bisection between stationary points.
+Points, directions and normals are lists of three floats in the frame of the scene (see `illumgrid.scene.Scene`).
+"""
+
+import math
+from dataclasses import dataclass
+from itertools import pairwise, product
+
+import numpy as np
+
+from illumgrid.rng import draw, stream
+
+SNAP = 1e-7
+"""A ray that starts this close to a plane of voxels, in index coordinates, starts on it."""
+
+
+@dataclass(frozen=True)
+class Hit:
+    """Where a ray ends: on a level set, on a cap, or at once because it starts inside a solid.
+
+    Parameters
+    ----------
+    t : float
+        Distance along the ray.
+    field : int
+        Number of the field that is hit.
+    x : list of float
+        Position in the frame.
+    normal : list of float or None
+        Outward unit normal in the frame; None where no light can be followed (within a solid, on a plateau).
+    cap : bool
+        True on the border of the field's box.
+    """
+
+    t: float
+    field: int
+    x: list
+    normal: list | None
+    cap: bool = False
+
+
+class Solid:
+    """The solid {v >= level} of one field in the box of its voxel centres; v is h, or -h where `inside` is "below"."""
+
+    def __init__(self, scene, levels, number):
+        field = scene.fields[number]
+        self.number = number
+        self.sign = 1.0 if field.inside == "above" else -1.0
+        self.level = self.sign * float(levels[number])
+        self.values = field.volume.values
+        self.origin = [float(c) for c in scene.to_frame(field.volume.origin)]
+        self.spacing = [float(c) for c in field.volume.spacing]
+        self.last = [n - 1 for n in field.volume.shape]
+
+    def v(self, voxel):
+        """Value at a voxel."""
+        return self.sign * float(self.values[voxel])
+
+    def corners(self, cell):
+        """Values at the corners of a cell, by corner (0 or 1 along each axis)."""
+        return {c: self.v(tuple(i + j for i, j in zip(cell, c))) for c in product((0, 1), repeat=3)}
+
+    def index(self, x):
+        """Index coordinates of a frame position, on a plane of voxels where they nearly are."""
+        u = [(x[a] - self.origin[a]) / self.spacing[a] for a in range(3)]
+        return [float(round(c)) if abs(c - round(c)) < SNAP else c for c in u]
+
+    def holds(self, x):
+        """Whether a frame position lies in the solid, its border included."""
+        u = self.index(x)
+        if any(not 0 <= u[a] <= self.last[a] for a in range(3)):
+            return False
+        cell = [min(math.floor(u[a]), self.last[a] - 1) for a in range(3)]
+        return along(self.corners(cell), [u[a] - cell[a] for a in range(3)], [0.0] * 3)[0] >= self.level
+
+
+# Polynomials are lists of coefficients, the constant first.
+
+
+def value(p, s):
+    """Value of a polynomial (Horner)."""
+    total = 0.0
+    for coefficient in reversed(p):
+        total = total * s + coefficient
+    return total
+
+
+def blend(p0, p1, x, dx):
+    """Polynomial p0 + (p1 - p0) (x + s dx), counted from the nearer end: exact at x = 0 and at x = 1."""
+    start, x = (p0, x) if x <= 0.5 else (p1, x - 1.0)
+    result = [*start, 0.0]
+    for i, c in enumerate(b - a for a, b in zip(p0, p1)):
+        result[i] += c * x
+        result[i + 1] += c * dx
+    return result
+
+
+def along(corners, f, df):
+    """Cubic in s: the trilinear cell at its local position f + s df."""
+    p = {c: [v] for c, v in corners.items()}
+    for axis in range(3):
+        p = {rest: blend(p[0, *rest], p[1, *rest], f[axis], df[axis]) for rest in product((0, 1), repeat=2 - axis)}
+    return p[()]
+
+
+def bisect(p, a, b):
+    """The end, on the side of b, of the last interval of floats between a and b over which the sign of p changes."""
+    side = value(p, b) >= 0
+    while a < (middle := 0.5 * (a + b)) < b:
+        if (value(p, middle) >= 0) == side:
+            b = middle
+        else:
+            a = middle
+    return b
+
+
+def changes(p, low, high):
+    """All places between low and high where the sign of p changes: one at most between stationary points."""
+    if len(p) < 2:
+        return []
+    slope = [i * c for i, c in enumerate(p)][1:]
+    knots = [low, *changes(slope, low, high), high]
+    return [bisect(p, a, b) for a, b in pairwise(knots) if (value(p, a) >= 0) != (value(p, b) >= 0)]
+
+
+def first_rise(p, length):
+    """Smallest s from 0 to length with p(s) >= 0, or None."""
+    if p[0] >= 0:
+        return 0.0
+    slope = [i * c for i, c in enumerate(p)][1:]
+    for a, b in pairwise([0.0, *changes(slope, 0.0, length), length]):
+        if value(p, b) >= 0:
+            return bisect(p, a, b)
+    return None
+
+
+# Rays in index coordinates: u + t du, where t is the distance in the frame.
+
+
+def span(solid, u, du):
+    """First and last t of the line within the box, and the axis of the face where it enters; None if it misses."""
+    t_in, t_out, axis = -math.inf, math.inf, 0
+    for a in range(3):
+        if du[a] == 0:
+            if not 0 <= u[a] <= solid.last[a]:
+                return None
+            continue
+        near, far = sorted(((0 - u[a]) / du[a], (solid.last[a] - u[a]) / du[a]))
+        if near > t_in:
+            t_in, axis = near, a
+        t_out = min(t_out, far)
+    return (t_in, t_out, axis) if t_in <= t_out else None
+
+
+def advance(u, du, t):
+    """Index coordinates at t, exactly on a plane of voxels that is crossed at t."""
+    result = [u[a] + t * du[a] for a in range(3)]
+    for a in range(3):
+        plane = float(round(result[a]))
+        if du[a] != 0 and (plane - u[a]) / du[a] == t:
+            result[a] = plane
+    return result
+
+
+def intervals(solid, u, du, t_in, t_out):
+    """Yield (t0, t1, cell) for the cells between t_in and t_out, in order."""
+    stops = {t_in, t_out}
+    for a in range(3):
+        if du[a] != 0:
+            stops.update(t for plane in range(solid.last[a] + 1) if t_in < (t := (plane - u[a]) / du[a]) < t_out)
+    for t0, t1 in pairwise(sorted(stops)):
+        middle = [u[a] + 0.5 * (t0 + t1) * du[a] for a in range(3)]
+        yield t0, t1, [min(max(math.floor(middle[a]), 0), solid.last[a] - 1) for a in range(3)]
+
+
+def entered(solid, u, du):
+    """Cell that a ray enters which starts at u, or None if it leaves the box."""
+    cell = [math.floor(u[a]) - (1 if u[a] == math.floor(u[a]) and du[a] < 0 else 0) for a in range(3)]
+    return cell if all(0 <= cell[a] < solid.last[a] for a in range(3)) else None
+
+
+def cubic(solid, cell, at, du):
+    """Cubic f(s) = v - level along the ray in a cell, s = 0 at the index coordinates `at`."""
+    p = along(solid.corners(cell), [at[a] - cell[a] for a in range(3)], du)
+    return [p[0] - solid.level, *p[1:]]
+
+
+def march(solid, u, du, t_in, t_out):
+    """First (t, cell) between t_in and t_out with v >= level, or None."""
+    for t0, t1, cell in intervals(solid, u, du, t_in, t_out):
+        if max(solid.corners(cell).values()) < solid.level:
+            continue  # a trilinear cell lies between its corners
+        s = first_rise(cubic(solid, cell, advance(u, du, t0), du), t1 - t0)
+        if s is not None:
+            return t0 + s, cell
+    return None
+
+
+def meet_own(solid, x, d, on):
+    """Hit of a ray that starts on the level set of this very solid, or None."""
+    u, du = solid.index(x), [d[a] / solid.spacing[a] for a in range(3)]
+    cell = entered(solid, u, du)
+    if cell is None:
+        return None
+    t_out = span(solid, u, du)[1]
+    t1 = next(intervals(solid, u, du, 0.0, t_out))[1]
+    f = cubic(solid, cell, u, du)[1:]  # its constant term is 0: divided by t
+    while f and f[0] == 0:
+        f = f[1:]
+    if not f or f[0] > 0:
+        return Hit(0.0, solid.number, x, on.normal)  # dips under the surface; a cell flat at the level is solid
+    t = first_rise(f, t1)
+    found = (t, cell) if t is not None else march(solid, u, du, t1, t_out)
+    return level_set_hit(solid, x, d, *found) if found else None
+
+
+def meet_other(solid, x, d):
+    """Hit of a ray that starts anywhere but on this solid, or None."""
+    u, du = solid.index(x), [d[a] / solid.spacing[a] for a in range(3)]
+    box = span(solid, u, du)
+    if box is None or box[1] <= 0:
+        return None
+    t_in, t_out, axis = box
+    found = march(solid, u, du, max(t_in, 0.0), t_out)
+    if found is None:
+        return None
+    if found[0] <= 0 and t_in < 0:
+        return Hit(0.0, solid.number, x, None)  # starts inside
+    if found[0] == t_in:
+        normal = [0.0, 0.0, 0.0]
+        normal[axis] = -math.copysign(1.0, d[axis])
+        return Hit(t_in, solid.number, [x[a] + t_in * d[a] for a in range(3)], normal, cap=True)
+    return level_set_hit(solid, x, d, *found)
+
+
+def level_set_hit(solid, x, d, t, cell):
+    """Hit in a cell."""
+    at = [x[a] + t * d[a] for a in range(3)]
+    f = [min(max((at[a] - solid.origin[a]) / solid.spacing[a] - cell[a], 0.0), 1.0) for a in range(3)]
+    return Hit(t, solid.number, at, outward_normal(solid, cell, f))
+
+
+def outward_normal(solid, cell, f):
+    """Gradient normal at the local position f of a cell; that of the trilinear cell where it is 0; None if both are."""
+    smooth = [0.0, 0.0, 0.0]
+    for corner in product((0, 1), repeat=3):
+        weight = math.prod(f[a] if corner[a] else 1 - f[a] for a in range(3))
+        voxel = [i + j for i, j in zip(cell, corner)]
+        for a in range(3):
+            smooth[a] += weight * central_difference(solid, voxel, a) / solid.spacing[a]
+    steps = [[1.0 / solid.spacing[a] if a == b else 0.0 for a in range(3)] for b in range(3)]
+    sharp = [along(solid.corners(cell), f, step)[1] for step in steps]
+    for gradient in (smooth, sharp):
+        if largest := max(map(abs, gradient)):
+            scaled = [c / largest for c in gradient]  # the square of a tiny gradient would be 0
+            return [-c / math.hypot(*scaled) for c in scaled]
+    return None
+
+
+def central_difference(solid, voxel, axis):
+    """Slope of v at a voxel, per voxel; one-sided at the border."""
+    before, after = list(voxel), list(voxel)
+    before[axis] = max(voxel[axis] - 1, 0)
+    after[axis] = min(voxel[axis] + 1, solid.last[axis])
+    return (solid.v(tuple(after)) - solid.v(tuple(before))) / (after[axis] - before[axis])
+
+
+# Light.
+
+
+def first_hit(scene, levels, x, d, on=None):
+    """What a ray meets first.
+
+    Parameters
+    ----------
+    scene : Scene
+    levels : (F,) sequence of float
+        Isovalue of each field.
+    x, d : sequence of float
+        Start and unit direction in the frame.
+    on : Hit, optional
+        The surface on which the ray starts.
+
+    Returns
+    -------
+    Hit or None
+        None if the ray escapes. A hit without a normal carries no light.
+    """
+    x, d = [float(c) for c in x], [float(c) for c in d]
+    hits = []
+    for number in range(len(scene.fields)):
+        solid = Solid(scene, levels, number)
+        if on is None or on.field != number:
+            hits.append(meet_other(solid, x, d))
+        elif not on.cap:  # a ray from a cap leaves the convex box
+            hits.append(meet_own(solid, x, d, on))
+    hits = [hit for hit in hits if hit is not None]
+    inside = [hit for hit in hits if hit.t == 0 and hit.normal is None]
+    return min(inside or hits, key=lambda hit: hit.t, default=None)  # of equals, min takes the first
+
+
+def cosine_direction(n, u1, u2):
+    """Cosine-distributed direction around n, in the tangent frame of Duff et al. (JCGT 6(1), 2017)."""
+    r, phi = math.sqrt(u1), 2 * math.pi * u2
+    local = (r * math.cos(phi), r * math.sin(phi), math.sqrt(1 - u1))
+    sign = 1.0 if n[2] >= -1e-6 else -1.0  # 0 comes out as -1e-17 in a turned frame
+    a = -1 / (sign + n[2])
+    b = n[0] * n[1] * a
+    tangent = (1 + sign * n[0] * n[0] * a, sign * b, -sign * n[0])
+    bitangent = (b, sign + n[1] * n[1] * a, -n[1])
+    return [local[0] * tangent[i] + local[1] * bitangent[i] + local[2] * n[i] for i in range(3)]
+
+
+def on_query(scene, query):
+    """Surface on which the one query in `query` lies, as a hit; its normal is 0 if none is defined."""
+    normal = query.normal[0] @ scene.fields[0].volume.direction
+    return Hit(0.0, int(query.target[0]), scene.to_frame(query.point[0]).tolist(), normal.tolist())
+
+
+def is_hole(scene, query):
+    """Whether the one query in `query` has no normal or lies in the solid of a field that is not its own."""
+    at = on_query(scene, query)
+    others = (k for k in range(len(scene.fields)) if k != at.field)
+    return not any(at.normal) or any(Solid(scene, query.level[0], k).holds(at.x) for k in others)
+
+
+def path_worth(scene, query, path, bounces, seed):
+    """Radiance (3,) that one path brings to a query (a `Queries` of length 1 that is no hole)."""
+    with np.errstate(over="ignore"):
+        key = stream(np.uint64(seed), query.id[0])
+        u = [float(draw(key, np.uint64(path), np.uint64(i))) for i in range(2 * bounces + 2)]
+    hit, worth, throughput = on_query(scene, query), np.zeros(3), np.ones(3)
+    for k in range(bounces + 1):
+        d = cosine_direction(hit.normal, u[2 * k], u[2 * k + 1])
+        hit = first_hit(scene, query.level[0], hit.x, d, on=hit)
+        if hit is None:
+            return worth + throughput * scene.background
+        if hit.normal is None:
+            return worth
+        material = scene.fields[hit.field].material
+        worth = worth + throughput * material.emission
+        throughput = throughput * material.albedo
+    return worth
+
+
+def solve(scene, queries, paths, bounces, seed):
+    """Irradiance of queries.
+
+    Returns
+    -------
+    mean, m2 : (n, 3) float64
+        Mean over the paths and sum of the squared deviations from it.
+    paths : (n,) int
+        Number of paths, 0 for holes.
+    """
+    mean, m2, count = np.zeros((len(queries), 3)), np.zeros((len(queries), 3)), np.zeros(len(queries), dtype=int)
+    for i in range(len(queries)):
+        query = queries[i : i + 1]
+        if len(paths) == 0 or is_hole(scene, query):
+            continue
+        light = np.array([math.pi * path_worth(scene, query, path, bounces, seed) for path in paths])
+        mean[i], count[i] = light.mean(axis=0), len(paths)
+        m2[i] = ((light - mean[i]) ** 2).sum(axis=0)
+    return mean, m2, count
