@@ -3,7 +3,7 @@
 import os
 import warnings
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from functools import cached_property
 from importlib.metadata import version
 from typing import Any
@@ -167,7 +167,7 @@ def run(
     levels = level_table(scene, 32 if isovalues is None else isovalues)
     options = {}
     if isovalues is not None and isinstance(sampler, str):
-        if "count" in {f.name for f in fields(registry.stage_class("sampler", sampler))}:
+        if "count" in registry.option_names("sampler", sampler):
             options["count"] = isovalues
     chosen = _stage("sampler", sampler, options), _stage("backend", backend), _stage("interpolator", interpolator)
     specs = [

@@ -36,6 +36,11 @@ def stage_class(kind: str, name: str) -> type[Any]:
     return cast(type[Any], getattr(importlib.import_module(f"illumgrid.{module}"), attribute))
 
 
+def option_names(kind: str, name: str) -> list[str]:
+    """Options of the stage of this kind and name."""
+    return [f.name for f in fields(stage_class(kind, name))]
+
+
 def make(kind: str, name: str, options: dict[str, Any]) -> Any:
     """Stage of this kind and name; options may be texts, which are parsed by the type of the stage's field.
 

@@ -285,15 +285,39 @@ def _read_exr(path: Path, plan: Plan) -> dict[str, dict[str, Image]]:
         raise BadInput(f"its {size} bytes cannot hold the arrays that {RUN} tells of")
     kind = OpenEXR.scanlineimage, OpenEXR.ZIP_COMPRESSION
     expected = [(name, *kind, [[0, 0], [x - 1, z * y - 1]], c.split()) for name, ((x, y, z), c) in plan.items()]
-    found = []
-    for header in (part.header for part in OpenEXR.File(os.fsencode(path), header_only=True).parts):
-        window = [np.asarray(corner).tolist() for corner in header["dataWindow"]]
-        channels = sorted(c.name for c in header["channels"])
-        found.append((header["name"], header["type"], header["compression"], window, channels))
-    if found and found != expected:  # before 3.4.12 the library gives no headers without the pixels
-        raise BadInput(f"its parts are not those that {RUN} tells of")
-    images = {p.name(): {c: i.pixels for c, i in p.channels.items()} for p in OpenEXR.File(os.fsencode(path)).parts}
-    # The library leaves out a part whose pixels it cannot read.
-    if list(images) != list(plan) or any(i.dtype != np.float32 for part in images.values() for i in part.values()):
-        raise BadInput("its pixels cannot be read")
+    for pixels in (False, True):
+        file = OpenEXR.File(os.fsencode(path), header_only=not pixels)
+        found = []  # the library leaves out a part whose pixels it cannot read; before 3.4.12, all without pixels
+        for h in (part.header for part in file.parts):
+            window = [np.asarray(corner).tolist() for corner in h["dataWindow"]]
+            found.append((h["name"], h["type"], h["compression"], window, sorted(c.name for c in h["channels"])))
+        if found != expected and (pixels or found):
+            raise BadInput(f"its parts are not those that {RUN} tells of, or cannot be read")
+    images = {part.name(): {c: image.pixels for c, image in part.channels.items()} for part in file.parts}
+    if any(image.dtype != np.float32 for part in images.values() for image in part.values()):
+        raise BadInput("its pixels are not float32")
     return images
+
+
+def is_run(folder: str | os.PathLike[str]) -> bool:
+    """Whether a folder looks like a finished run, rather than one of DICOM slices."""
+    return (Path(folder) / RUN).is_file() or (Path(folder) / EXR).is_file()
+
+
+def write_file(path: str | os.PathLike[str], content: bytes) -> None:
+    """Write a file beside its place and rename it: whole, or not there.
+
+    Raises
+    ------
+    BadInput
+        If it cannot be written.
+    """
+    place = Path(path)
+    with _sentences(f"{path} could not be written", "choose another place with -o"):
+        if place.is_dir():
+            raise BadInput(f"{path} is a folder; expected the name of a file")
+        place.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=f".{place.name[:50]}-", dir=place.parent) as work:
+            fresh = Path(work) / "new"
+            fresh.write_bytes(content)
+            fresh.replace(place)

@@ -1,22 +1,20 @@
 """From linear light to what a screen shows: the only place where light is clamped."""
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 WHITE = 0.8
 """Display radiance that automatic exposure gives to the brightest surfaces; sRGB 0.91, short of clipping."""
 
 
-def luminance(rgb: ArrayLike) -> NDArray[np.floating]:
-    """Relative luminance (...) of linear RGB (..., 3), Rec. 709."""
-    return np.asarray(rgb) @ np.array([0.2126, 0.7152, 0.0722], dtype=np.float32)
-
-
 def automatic_exposure(radiance: NDArray[np.floating]) -> float:
-    """Factor that brings the 98th percentile of the luminance of (n, 3) radiances to `WHITE`; 1 where all is dark."""
+    """Factor that brings the 98th percentile of the brightest channel of (n, 3) radiances to `WHITE`; 1 if all is dark.
+
+    The brightest channel, not the luminance: a saturated surface keeps its hue.
+    """
     if not len(radiance):
         return 1.0
-    bright = float(np.quantile(luminance(radiance), 0.98))
+    bright = float(np.quantile(radiance.max(axis=1), 0.98))
     return WHITE / bright if bright > 0 and np.isfinite(bright) else 1.0
 
 

@@ -66,7 +66,8 @@ def placement(origin: ArrayLike, spacing: ArrayLike, direction: ArrayLike) -> tu
         raise BadInput(f"direction is {axes.tolist()}; expected a 3x3 matrix whose columns are orthonormal")
     u, _, v = np.linalg.svd(axes)
     nearest = u @ v
-    return at, step, axes if np.array_equal(axes @ axes.T, np.eye(3)) else nearest
+    # What is orthonormal to rounding stays as it is, so that a volume survives any number of round trips to disk.
+    return at, step, axes if np.abs(axes @ axes.T - np.eye(3)).max() < 1e-14 else nearest
 
 
 @dataclass(frozen=True, eq=False)
@@ -235,7 +236,11 @@ def project(volume: Volume, index: Floats, isovalues: Floats) -> tuple[Floats, N
     last = np.full(len(at), np.inf)
     for _ in range(24):
         miss = isovalues - interpolate(volume, at)
-        slope = cell_gradient(volume, at) * volume.spacing  # per index step
+        slope = cell_gradient(volume, at)
+        flat = ~slope.any(axis=1)
+        if flat.any():  # at the edge of a plateau the way out is known to the central differences only
+            slope[flat] = smooth_gradient(volume, at[flat])
+        slope *= volume.spacing  # per index step
         steep = (slope * slope).sum(axis=1)
         step = slope * np.divide(miss, steep, out=np.zeros_like(miss), where=steep > 0)[:, None]
         length = np.abs(step).max(axis=1, initial=0.0)

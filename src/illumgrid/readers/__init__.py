@@ -4,6 +4,7 @@ A header is not believed: what it promises is held against the size of the file 
 """
 
 import gzip
+import io
 import os
 import re
 import struct
@@ -86,8 +87,9 @@ def read_volume(path: str | os.PathLike[str]) -> Volume:
 
 def _reason(problem: BaseException) -> str:
     """Say what an exception says, in one line: ITK tells its source file and an address first."""
-    text = re.sub(r"(?s).*(sitk::|ITK )ERROR:|\w+\(0x[0-9a-f]+\): ", "", str(problem))
-    return " ".join(text.split()).rstrip(".!")[-200:] or type(problem).__name__
+    # MetaImage gives a reason that is none (what errno happens to be); folders may be temporary.
+    text = re.sub(r"(?s).*(sitk::|ITK )ERROR:|\w+\(0x[0-9a-f]+\): |\. Reason: .*|/\S+/", "", str(problem))
+    return re.sub(r"[.!?:]+ ", ", ", " ".join(text.split())).rstrip(".!")[-200:] or type(problem).__name__
 
 
 def _read(file: Path) -> Volume:
@@ -105,8 +107,8 @@ def _read(file: Path) -> Volume:
     if file.suffix.lower() != ".gz":
         return _read_unpacked(file, size)
     if file.stem.lower().endswith(".npy"):
-        with gzip.open(file) as stream:
-            return Volume(read_npy(stream, size * DEFLATE))
+        with gzip.open(file) as unpacked:
+            return Volume(read_npy(io.BufferedReader(unpacked), size * DEFLATE))
     with TemporaryDirectory(prefix="illumgrid-") as folder:
         inner = Path(folder) / file.stem
         _unpack(file, inner, size * DEFLATE)

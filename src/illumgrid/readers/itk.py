@@ -38,7 +38,8 @@ def unpacked_bytes(file: Path) -> int:
         reader, width = _header(file)
     disk = on_disk(file, reader, width)
     # As text a number takes up to 32 characters; what cannot be packed grows a little.
-    return CHUNK + disk.start + math.prod(reader.GetSize()) * (32 if disk.form == "text" else disk.width + 1)
+    voxels: int = math.prod(reader.GetSize())
+    return CHUNK + disk.start + voxels * (32 if disk.form == "text" else disk.width + 1)
 
 
 def read_dicom(folder: Path) -> Volume:

@@ -128,8 +128,8 @@ def _meta(file: Path, head: str, width: int) -> OnDisk:
 
 def _data_files(file: Path, named: str, lines: Sequence[str]) -> tuple[Path, ...]:
     """List the files that a detached header names, which lie relative to it."""
-    if named.split()[0] == "LIST":
-        first = next(k for k, line in enumerate(lines) if line.split()[-1:] == ["LIST"] or " LIST " in line)
+    if named.split()[:1] == ["LIST"]:
+        first = [line.rstrip().endswith(named) for line in lines].index(True)
         return _present([file.parent / line.strip() for line in lines[first + 1 :] if line.strip()])
     if "%" in named:  # a pattern and its numbers: whatever it means, it names files in that folder
         folder = (file.parent / named.split()[0]).parent
@@ -157,35 +157,61 @@ def check_words(file: Path, start: int, least: int) -> None:
 
 
 def check_tiff(file: Path) -> None:
-    """Refuse a TIFF that is cut (ITK would read fewer pages) or that ITK would reduce to 8 bits; other files pass."""
+    """Refuse a TIFF that is cut, whose pages differ (ITK would overrun its buffer) or that ITK would reduce to 8 bits.
+
+    Files of other formats pass.
+    """
     with open(file, "rb") as stream:
         start = stream.read(16)
         if start[:4] not in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"):
             return
-        order = "<" if start[:2] == b"II" else ">"
         big = b"+" in start[:4]
-        at = struct.unpack(order + ("Q" if big else "I"), start[8:16] if big else start[4:8])[0]
-        seen: set[int] = set()
+        order: Literal["little", "big"] = "little" if start[:2] == b"II" else "big"
+        at = int.from_bytes(start[8:16] if big else start[4:8], order)
+        pages: dict[int, dict[int, int]] = {}
         while at:
-            if at in seen:
+            if at in pages:
                 raise BadInput(f"the pages of this TIFF run in a circle; {AGAIN}")
-            seen.add(at)
-            at = _tiff_page(stream, at, order, big, file.stat().st_size)
+            following, tags = _tiff_page(stream, at, order, big, file.stat().st_size)
+            pages[at] = {tag: value for tag, value in tags.items() if tag in TIFF_FORM}
+            at = following
+    form = next(iter(pages.values()), {})
+    if any(page != form for page in pages.values()) or form.get(254) not in (None, 0, 2) or 255 in form:
+        raise BadInput("the pages of this TIFF differ in size or form; expected equal slices; save it as .nrrd")
+    usual = form.get(277, 1) > 1 or form.get(258) in ((32,) if form.get(339) == 3 else (8, 16, 32))
+    if not form.get(256) or not form.get(257) or 322 in form or not usual:
+        raise BadInput("a TIFF in tiles or of unusual bits; expected strips of 8, 16 or 32 bits; save it as .nrrd")
 
 
-def _tiff_page(stream: IO[bytes], at: int, order: str, big: bool, size: int) -> int:
-    """Check the page at byte `at`; where the next one is, or 0."""
-    count, entry, pointer = ("Q", "HHQHxxxxxx", "Q") if big else ("H", "HHIHxx", "I")
-    left = size - at - struct.calcsize(order + count + pointer)
+TIFF_FORM = {254, 255, 256, 257, 258, 259, 262, 266, 274, 277, 278, 284, 317, 322, 323, 338, 339}
+"""Tags that must agree: kind of page, width (256), height, bits, packing, samples (277), tiles (322), numbers (339)."""
+
+
+TIFF_BYTES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, 13: 4, 16: 8, 17: 8, 18: 8}
+"""Bytes of one number, by its type."""
+
+
+def _tiff_page(
+    stream: IO[bytes], at: int, order: Literal["little", "big"], big: bool, size: int
+) -> tuple[int, dict[int, int]]:
+    """Where the page after that at byte `at` is, or 0; and the tags that hold one whole number."""
+    counter, entry, pointer = (8, 20, 8) if big else (2, 12, 4)
+    left = size - at - counter - pointer
     length = 0
     if left >= 0:
         stream.seek(at)
-        length = struct.unpack(order + count, stream.read(struct.calcsize(count)))[0] * struct.calcsize(order + entry)
+        length = int.from_bytes(stream.read(counter), order) * entry
     if length > left:
         raise BadInput(f"the TIFF ends before its last page; {AGAIN}")
-    entries = struct.iter_unpack(order + entry, stream.read(length))
-    tags = {tag: value for tag, _, number, value in entries if number == 1}
-    bits, samples, form = tags.get(258, 8), tags.get(277, 1), tags.get(339, 1)
-    if 322 in tags or (samples == 1 and bits not in (8, 16, 32)) or (form == 3 and bits != 32):  # 322: tile width
-        raise BadInput("a TIFF in tiles or of unusual bits; expected strips of 8, 16 or 32 bits; save it so or as .nrrd")
-    return int(struct.unpack(order + pointer, stream.read(struct.calcsize(pointer)))[0])
+    table = stream.read(length)
+    tags: dict[int, int] = {}
+    for k in range(0, length, entry):
+        tag, kind = (int.from_bytes(table[k + j : k + j + 2], order) for j in (0, 2))
+        value = k + entry - pointer
+        number = int.from_bytes(table[k + 4 : value], order)
+        extent = number * TIFF_BYTES.get(kind, 0)
+        if extent > pointer and int.from_bytes(table[value : value + pointer], order) + extent > size:
+            raise BadInput(f"a tag of the TIFF leaves the file; {AGAIN}")
+        if number == 1 and kind in (1, 3, 4, 16) and extent <= pointer:  # byte, short, long, long long
+            tags.setdefault(tag, int.from_bytes(table[value : value + extent], order))  # of two, the first counts
+    return int.from_bytes(stream.read(pointer), order), tags

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from illumgrid.grid import GridSpec
 from illumgrid.samples import Queries
 from illumgrid.scene import Field, Scene
+from illumgrid.volume import interpolate, world_to_index
 
 _BATCH = 1 << 14
 
@@ -48,7 +49,11 @@ def reachable(field: Field, spec: GridSpec) -> NDArray[np.int64]:
 
 @dataclass(frozen=True)
 class Direct:
-    """One query on each grid node that a sweep can reach, on the level set through the node itself."""
+    """One query on each grid node that a sweep can reach, on the level set through the node itself.
+
+    A node of the rim, whose own isovalue lies outside the range, asks at the nearest end of the range instead, from the
+    point of that level set to which the gradient leads.
+    """
 
     name: ClassVar[str] = "direct"
 
@@ -58,7 +63,11 @@ class Direct:
             nodes = reachable(field, spec)
             for first in range(0, len(nodes), _BATCH):
                 batch = nodes[first : first + _BATCH]
-                asked = Queries.at(scene, spec.nodes(batch), field=number)
+                points = spec.nodes(batch)
+                own = interpolate(field.volume, world_to_index(field.volume, points))
+                # A rim node stands for the end of the range: light of a level that no sweep reaches would be wrong
+                # there (at the value of an empty background everything is solid, and dark).
+                asked = Queries.at(scene, points, field=number, level=np.clip(own, *field.range))
                 yield Queries(
                     batch.astype(np.uint64) | np.uint64(number << 40), asked.point, asked.normal, asked.level, asked.target
                 )

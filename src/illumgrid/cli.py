@@ -1,0 +1,350 @@
+"""The command line: the only place that prints."""
+
+import sys
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Optional
+
+import typer
+
+from illumgrid.errors import BadInput, IllumgridWarning
+
+if TYPE_CHECKING:
+    from illumgrid.bake import Progress
+    from illumgrid.illumination import Illumination
+    from illumgrid.scene import Scene
+    from illumgrid.volume import Volume
+
+app = typer.Typer(
+    help="Global illumination for every isosurface of a volume at once.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+
+
+def say(text: str) -> None:
+    """One line to the user, not to a pipe."""
+    typer.echo(text, err=True)
+
+
+@contextmanager
+def heard() -> Iterator[list[str]]:
+    """Collect the package's warnings as sentences, and say each when it is heard."""
+    sentences: list[str] = []
+
+    def show(message: Warning | str, category: type[Warning], *rest: Any) -> None:
+        if issubclass(category, IllumgridWarning):
+            sentences.append(str(message))
+            say(f"note: {message}")
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", IllumgridWarning)
+        warnings.showwarning = show  # type: ignore[assignment]
+        yield sentences
+
+
+@contextmanager
+def told_progress() -> Iterator["Progress"]:
+    """A bar with the time left, for work that takes longer than a moment."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+
+    bars: dict[str, Any] = {}
+    console = Console(stderr=True)
+    with Progress(
+        TextColumn("{task.description:<6}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn(),
+        console=console, transient=True, disable=not console.is_terminal,
+    ) as progress:  # fmt: skip
+
+        def tell(what: str, done: int, total: int) -> None:
+            if what not in bars:
+                bars[what] = progress.add_task(what, total=max(total, 1))
+            progress.update(bars[what], completed=done)
+
+        yield tell
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        from importlib.metadata import version
+
+        typer.echo(f"illumgrid {version('illumgrid')}")
+        raise typer.Exit
+
+
+@app.callback()
+def root(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Show the version and exit.")
+    ] = False,
+) -> None:
+    """Global illumination for every isosurface of a volume at once."""
+
+
+def _given(**options: Any) -> str:
+    """Names of the options that were given, as typed."""
+    return ", ".join(f"--{name}" for name, value in options.items() if value is not None)
+
+
+def _volume_scene(
+    source: str,
+    smooth: float,
+    limits: tuple[float, float] | None,
+    inside: Literal["above", "below"],
+    albedo: tuple[float, float, float],
+) -> "Scene":
+    from illumgrid.readers import read_volume, volume_name
+    from illumgrid.scene import Scene
+    from illumgrid.volume import finite
+    from illumgrid.volume import smooth as blur
+
+    volume = blur(finite(read_volume(source), inside), smooth)
+    return Scene.sky(volume, albedo, limits, inside, volume_name(source))
+
+
+def _stage_options(settings: list[str]) -> dict[str, dict[str, str]]:
+    """`STAGE.OPTION=VALUE` texts, by stage."""
+    options: dict[str, dict[str, str]] = {"sampler": {}, "backend": {}, "interpolator": {}}
+    for text in settings:
+        place, equals, value = text.partition("=")
+        stage, dot, option = place.partition(".")
+        if not (equals and dot and option) or stage not in options:
+            raise BadInput(
+                f"--set got {text!r}; expected STAGE.OPTION=VALUE with STAGE one of {', '.join(options)}, "
+                "such as sampler.count=40"
+            )
+        options[stage][option] = value
+    return options
+
+
+def _default_folder(name: str) -> Path:
+    return Path(f"{name}-light")
+
+
+@app.command()
+def run(
+    source: Annotated[
+        Optional[str], typer.Argument(metavar="[INPUT]", help="A volume file or DICOM folder, or a built-in scene: nucleus.")
+    ] = None,
+    output: Annotated[
+        Optional[Path], typer.Option("--output", "-o", metavar="DIR", help="Where the result goes. [default: INPUT-light]")
+    ] = None,
+    sampler: Annotated[str, typer.Option(help="Where to ask for light: direct, uniform.")] = "direct",
+    isovalues: Annotated[
+        Optional[int], typer.Option(min=2, metavar="K", help="Rows of the level table; sampler.count too. [default: 32]")
+    ] = None,
+    limits: Annotated[
+        Optional[tuple[float, float]],
+        typer.Option("--range", metavar="LO HI", help="Isovalues to sweep. [default: from the data, as info suggests]"),
+    ] = None,
+    inside: Annotated[
+        Optional[str], typer.Option(help="Which side of the isovalue is solid: above, below. [default: above]")
+    ] = None,
+    backend: Annotated[str, typer.Option(help="Light transport: auto, numba, reference.")] = "auto",
+    paths: Annotated[Optional[int], typer.Option(min=1, metavar="N", help="Light paths from every query. [default: 64]")] = None,
+    bounces: Annotated[int, typer.Option(min=0, metavar="N", help="Reflections of a path.")] = 4,
+    seed: Annotated[int, typer.Option(min=0, metavar="N", help="Equal seeds give equal light.")] = 0,
+    interpolator: Annotated[str, typer.Option(help="From samples to nodes: nearest.")] = "nearest",
+    grid: Annotated[
+        Optional[int],
+        typer.Option(min=2, metavar="N", help="Nodes along the longest axis. [default: as voxels, at most 128]"),
+    ] = None,
+    albedo: Annotated[
+        Optional[tuple[float, float, float]],
+        typer.Option(metavar="R G B", help="Share of light that the surface reflects. [default: 0.8 0.8 0.8]"),
+    ] = None,
+    settings: Annotated[
+        Optional[list[str]], typer.Option("--set", metavar="STAGE.OPTION=VALUE", help="Any option of a stage, repeatable.")
+    ] = None,
+    smooth: Annotated[
+        Optional[float], typer.Option(min=0.0, metavar="SIGMA", help="Gaussian blur in voxels before anything else.")
+    ] = None,
+    threads: Annotated[Optional[int], typer.Option(min=1, metavar="N", help="Threads. [default: one a processor]")] = None,
+    no_preview: Annotated[bool, typer.Option("--no-preview", help="Leave the picture out.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a finished run in DIR.")] = False,
+) -> None:
+    """Light a volume, or a built-in scene, for all isovalues at once.
+
+    DIR then holds illumination.exr, run.json and preview.png, and needs nothing else.
+    """
+    begun = time.perf_counter()
+    from illumgrid import registry, store
+    from illumgrid.demo import SCENES
+    from illumgrid.illumination import run as light_up
+
+    options = _stage_options(settings or [])
+    if threads is not None and "threads" in registry.option_names("backend", backend):
+        options["backend"].setdefault("threads", str(threads))
+    if isovalues is not None and "count" in registry.option_names("sampler", sampler):
+        options["sampler"].setdefault("count", str(isovalues))
+    stages = {
+        kind: registry.make(kind, name, options[kind])
+        for kind, name in (("sampler", sampler), ("backend", backend), ("interpolator", interpolator))
+    }
+    with heard() as sentences:
+        if source is None or (source in SCENES and not Path(source).exists()):
+            name = source or "nucleus"
+            preset = SCENES[name]
+            if extra := _given(range=limits, inside=inside, albedo=albedo, smooth=smooth):
+                raise BadInput(f"{extra} came with the built-in scene {name!r}; expected a volume file with them: leave them out")
+            folder = output or _default_folder(name)
+            store.claim(folder, overwrite)
+            scene, grid, paths = preset.make(), grid or preset.grid, paths or preset.paths
+        else:
+            if inside not in (None, "above", "below"):
+                raise BadInput(f"--inside is {inside!r}; expected above or below")
+            from illumgrid.readers import volume_name
+
+            name = source
+            folder = output or _default_folder(volume_name(source))
+            store.claim(folder, overwrite)
+            scene = _volume_scene(
+                source, smooth or 0.0, limits, "below" if inside == "below" else "above", albedo or (0.8, 0.8, 0.8)
+            )
+        for field in scene.fields:
+            shape = " x ".join(map(str, field.volume.shape))
+            say(f"{field.name}: {shape} voxels, isovalues {field.range[0]:.4g} to {field.range[1]:.4g}")
+        with told_progress() as progress:
+            light = light_up(
+                scene, **stages, grid=grid, paths=paths or 64, bounces=bounces, isovalues=isovalues, seed=seed,
+                progress=progress,
+            )  # fmt: skip
+    recipe = {**light.recipe, "input": name, "smooth": smooth or 0.0, "warnings": sentences}
+    replace(light, recipe=recipe).save(folder, preview=not no_preview, overwrite=overwrite)
+    _told_result(light, folder, time.perf_counter() - begun, picture=not no_preview)
+
+
+def _told_result(light: "Illumination", folder: Path, seconds: float, picture: bool) -> None:
+    errors = [e for e in light.recipe["relative_error"] if e is not None]
+    noise = f", noise about {max(errors):.1%} of the mean light" if errors else ""
+    say(f"{light.recipe['queries']} queries x {light.recipe['paths']} paths in {seconds:.1f} s{noise}")
+    say(f"wrote {folder}" + (f"; look at {folder / 'preview.png'}" if picture else ""))
+
+
+@app.command()
+def preview(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="A finished run.")],
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="PNG", help="The picture to write.")],
+    field: Annotated[
+        Optional[str], typer.Option(metavar="NAME", help="Field that --isovalue belongs to. [default: the first]")
+    ] = None,
+    isovalue: Annotated[
+        Optional[float], typer.Option(metavar="C", help="Isovalue to show. [default: the middle of the range]")
+    ] = None,
+    local: Annotated[bool, typer.Option("--local", help="A lamp at the camera in place of the computed light.")] = False,
+) -> None:
+    """Draw one isosurface of a finished run."""
+    from illumgrid import preview as pictures
+    from illumgrid import store
+    from illumgrid.illumination import load
+
+    if output.suffix.lower() != ".png":
+        raise BadInput(f"--output is {output.name!r}; expected a file name that ends in .png")
+    light = load(folder)
+    number = 0 if field is None else light.scene.number_of(field)
+    if isovalue is not None:
+        low, high = light.scene.fields[number].range
+        if not low <= isovalue <= high:
+            say(f"note: the isovalue {isovalue:g} lies outside the range {low:g} to {high:g} that the light was computed for")
+    store.write_file(output, pictures.png(pictures.render(light, field, isovalue, local=local)))
+    say(f"wrote {output}" + ("" if local else f" at exposure {light.exposure:.4g}"))
+
+
+BLOCKS = " ▁▂▃▄▅▆▇█"
+
+
+def histogram_line(volume: "Volume", width: int = 64) -> str:
+    """Histogram of the finite values in a line of block characters; heights are logarithmic."""
+    import numpy as np
+
+    counts, _ = np.histogram(volume.values[np.isfinite(volume.values)], width)
+    height = np.log1p(counts) / max(np.log1p(counts.max()), 1e-9)
+    return "".join(BLOCKS[int(np.ceil(h * 8))] for h in height)
+
+
+@app.command()
+def info(
+    source: Annotated[str, typer.Argument(metavar="DIR|VOLUME", help="A finished run, a volume file or a DICOM folder.")],
+) -> None:
+    """Tell what is inside a volume or a finished run."""
+    from illumgrid import store
+
+    with heard():
+        if store.is_run(source):
+            _told_run(source)
+        else:
+            _told_volume(source)
+
+
+def _told_volume(source: str) -> None:
+    from illumgrid.readers import read_volume, volume_name
+    from illumgrid.scene import suggest_range
+    from illumgrid.volume import finite
+
+    volume = finite(read_volume(source), "above")
+    _told_lattice(volume_name(source), volume)
+    low, high, why = suggest_range(volume)
+    typer.echo(f"  suggested range  {low:.4g} to {high:.4g}: {why}")
+
+
+def _told_lattice(name: str, volume: "Volume") -> None:
+    def three(numbers: Any) -> str:
+        return ", ".join(f"{x:.6g}" for x in numbers)
+
+    low, high = float(volume.values.min()), float(volume.values.max())
+    typer.echo(f"{name}")
+    typer.echo(f"  shape            {' x '.join(map(str, volume.shape))} voxels (x, y, z)")
+    typer.echo(f"  spacing          {three(volume.spacing)}")
+    typer.echo(f"  origin           {three(volume.origin)} (world; for medical formats LPS millimetres)")
+    typer.echo(f"  axes             {'; '.join(three(volume.direction[:, axis]) for axis in range(3))}")
+    typer.echo(f"  values           {low:.6g} to {high:.6g}")
+    typer.echo(f"  histogram        |{histogram_line(volume)}| (logarithmic)")
+
+
+def _told_run(source: str) -> None:
+    from illumgrid.illumination import load
+
+    light = load(source)
+    for field, grid in zip(light.scene.fields, light.grids):
+        _told_lattice(field.name, field.volume)
+        typer.echo(f"  range            {field.range[0]:.6g} to {field.range[1]:.6g}, inside {field.inside}")
+        supported = float((grid.support > 0).mean())
+        typer.echo(f"  light            {' x '.join(map(str, grid.spec.shape))} nodes, {supported:.1%} with light of their own")
+    recipe = light.recipe
+    names = ", ".join(f"{kind} {recipe[kind]['name']}" for kind in ("sampler", "backend", "interpolator") if kind in recipe)
+    typer.echo(f"recipe: {names}, {recipe.get('paths')} paths, {recipe.get('bounces')} bounces, seed {recipe.get('seed')}")
+    for sentence in recipe.get("warnings", []):
+        typer.echo(f"note: {sentence}")
+
+
+def main() -> None:
+    """Run the command line: exit 2 and one sentence on bad input, 130 on Ctrl-C."""
+    sys.exit(guarded(lambda: app(standalone_mode=False)))
+
+
+def guarded(command: Callable[[], Any]) -> int:
+    """Exit code of a command."""
+    import click
+
+    try:
+        code = command()
+        return code if isinstance(code, int) else 0
+    except click.ClickException as error:
+        error.show()
+        return 2
+    except (click.Abort, KeyboardInterrupt):
+        say("illumgrid: stopped; nothing was written")
+        return 130
+    except BadInput as error:
+        say(f"illumgrid: {error}")
+    except MemoryError:
+        say("illumgrid: the memory of this machine is too small for this; choose a coarser --grid or a smaller volume")
+    except OSError as error:
+        say(f"illumgrid: {error.strerror or error}{f': {error.filename}' if error.filename else ''}")
+    return 2
