@@ -1,6 +1,5 @@
 """Volumes of every kind come back as they were written, where they were."""
 
-import gzip
 import struct
 from pathlib import Path
 
@@ -8,11 +7,23 @@ import numpy as np
 import pytest
 import SimpleITK as sitk  # noqa: N813
 import tifffile
-from volume_files import *
 
 from illumgrid.errors import IllumgridWarning
 from illumgrid.readers import read_volume, volume_name
 from illumgrid.volume import index_to_world
+from volume_files import (
+    ORIGIN,
+    SPACING,
+    TURN,
+    meta_head,
+    nrrd_head,
+    refused,
+    values,
+    vtk_head,
+    write,
+    write_series,
+    zipped,
+)
 
 VOLUMES = Path(__file__).parents[2] / "shared" / "volumes"
 CORNERS = [(0, 0, 0), (4, 0, 0), (0, 5, 0), (0, 0, 6), (3, 2, 5)]

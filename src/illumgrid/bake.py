@@ -9,6 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from illumgrid.grid import GridSpec, IlluminationGrid
+from illumgrid.samplers.direct import reachable
 from illumgrid.samples import Queries, Samples, join_samples
 from illumgrid.scene import Scene
 from illumgrid.stages import Backend, Interpolator, Sampler
@@ -52,8 +53,9 @@ def _answer(scene: Scene, backend: Backend, paths: range, bounces: int, seed: in
 
 def holes_within_range(scene: Scene, field: int, grid: IlluminationGrid) -> int:
     """Nodes without support through which an isosurface of the range passes."""
-    empty = np.flatnonzero(grid.support == 0)
     own = scene.fields[field]
+    near = reachable(own, grid.spec)
+    empty = near[grid.support.reshape(-1)[near] == 0]
     level = interpolate(own.volume, world_to_index(own.volume, grid.spec.nodes(empty)))
     return int(((level >= own.range[0]) & (level <= own.range[1])).sum())
 

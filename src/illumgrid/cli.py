@@ -330,15 +330,10 @@ def main() -> None:
 
 def guarded(command: Callable[[], Any]) -> int:
     """Exit code of a command."""
-    import click
-
     try:
         code = command()
         return code if isinstance(code, int) else 0
-    except click.ClickException as error:
-        error.show()
-        return 2
-    except (click.Abort, KeyboardInterrupt):
+    except (typer.Abort, KeyboardInterrupt):
         say("illumgrid: stopped; nothing was written")
         return 130
     except BadInput as error:
@@ -347,4 +342,8 @@ def guarded(command: Callable[[], Any]) -> int:
         say("illumgrid: the memory of this machine is too small for this; choose a coarser --grid or a smaller volume")
     except OSError as error:
         say(f"illumgrid: {error.strerror or error}{f': {error.filename}' if error.filename else ''}")
+    except Exception as error:
+        if not hasattr(error, "show"):  # a usage error: of click's, or of typer's own copy of click, as its release has it
+            raise
+        error.show()
     return 2

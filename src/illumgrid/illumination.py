@@ -199,10 +199,10 @@ def run(
 
 
 def _relative_error(grids: tuple[IlluminationGrid, ...]) -> list[float | None]:
-    """For each grid, the median over its nodes of the standard error, divided by the mean irradiance; None below two paths."""
+    """For each grid, root mean square standard error of its nodes over their mean irradiance; None below two paths."""
     result: list[float | None] = []
     for grid in grids:
         known = np.isfinite(grid.error) & (grid.support > 0)
         mean = float(grid.values[known].mean()) if known.any() else 0.0
-        result.append(float(np.median(grid.error[known])) / mean if mean > 0 else None)
+        result.append(float(np.sqrt(np.square(grid.error[known], dtype=float).mean())) / mean if mean > 0 else None)
     return result

@@ -221,6 +221,10 @@ def outward_normals(volume: Volume, index: Floats, inside: Side) -> Floats:
     return gradient / np.where(length > 0, length, 1.0)
 
 
+_MET = 1e-10
+"""Newton steps this short, in index coordinates, end a projection; the last of them is still taken, and squares it."""
+
+
 def project(volume: Volume, index: Floats, isovalues: Floats) -> tuple[Floats, NDArray[np.bool_]]:
     """Move fractional indices (n, 3) onto the trilinear level sets of `isovalues` (n,), by Newton steps along the gradient.
 
@@ -231,31 +235,34 @@ def project(volume: Volume, index: Floats, isovalues: Floats) -> tuple[Floats, N
     arrived : (n,) bool
         False where the steps did not converge within one cell of the start, or left the volume.
     """
-    start, at = index, index.copy()
+    at = index.copy()
     top = np.array(volume.shape) - 1.0
+    arrived = ((index >= -ON_A_VOXEL) & (index <= top + ON_A_VOXEL)).all(axis=1)
     last = np.full(len(at), np.inf)
+    moving = np.flatnonzero(arrived)
     for _ in range(24):
-        miss = isovalues - interpolate(volume, at)
-        slope = cell_gradient(volume, at)
+        here = at[moving]
+        miss = isovalues[moving] - interpolate(volume, here)
+        slope = cell_gradient(volume, here)
         flat = ~slope.any(axis=1)
         if flat.any():  # at the edge of a plateau the way out is known to the central differences only
-            slope[flat] = smooth_gradient(volume, at[flat])
+            slope[flat] = smooth_gradient(volume, here[flat])
         slope *= volume.spacing  # per index step
-        steep = (slope * slope).sum(axis=1)
-        step = slope * np.divide(miss, steep, out=np.zeros_like(miss), where=steep > 0)[:, None]
+        largest = np.abs(slope).max(axis=1, initial=0.0)
+        step = slope / np.where(largest > 0, largest, 1.0)[:, None]  # scaled: the square of a tiny slope would underflow
+        step *= np.divide(miss / np.where(largest > 0, largest, 1.0), (step * step).sum(axis=1), where=largest > 0,
+                          out=np.zeros_like(miss))[:, None]  # fmt: skip
         length = np.abs(step).max(axis=1, initial=0.0)
+        # Where the set is met, the step is rounding; where there is no slope, it never will be.
+        there = (length < _MET) & (largest > 0) | (miss == 0)
+        arrived[moving[(largest == 0) & (miss != 0)]] = False
         # Across a kink between two cells full steps can swing to and fro: halve those that did not shrink.
-        step *= np.where(length >= last, 0.5, 1.0)[:, None]
+        step *= np.where(length >= last[moving], 0.5, 1.0)[:, None]
         step *= np.minimum(1.0, 0.5 / np.maximum(length, 1e-300))[:, None]
-        last = np.minimum(last, length)
-        at = np.clip(at + step, 0.0, top)
-        if (length < 1e-13 * np.maximum(1.0, top.max())).all():
+        last[moving] = np.minimum(last[moving], length)
+        at[moving] = np.where((miss == 0)[:, None], here, np.clip(here + step, 0.0, top))
+        moving = moving[~there & arrived[moving]]
+        if not len(moving):
             break
-    # What is left is judged as a distance: the miss over the slope.
-    slope = cell_gradient(volume, at) * volume.spacing
-    steepness = np.linalg.norm(slope, axis=1)
-    miss = np.abs(isovalues - interpolate(volume, at))
-    inside = ((start >= -ON_A_VOXEL) & (start <= top + ON_A_VOXEL)).all(axis=1)
-    arrived = inside & (np.abs(at - start).max(axis=1, initial=0.0) <= 1.0) & (miss <= 1e-9 * steepness)
-    arrived |= inside & (miss == 0)
-    return at, arrived
+    arrived[moving] = False
+    return at, arrived & (np.abs(at - index).max(axis=1, initial=0.0) <= 1.0)

@@ -1,0 +1,164 @@
+"""The grid: where its nodes lie, what is read between them, and how holes are filled."""
+
+import numpy as np
+import pytest
+
+from illumgrid.grid import GridSpec, IlluminationGrid, fill_holes, read_lattice
+from illumgrid.volume import Volume, index_to_world
+from shapes import DIRECTIONS, MIRRORED, refused
+
+UNEVEN = np.array([0.5, 1.25, 3.0])
+
+
+def volume(shape, **place):
+    return Volume(np.zeros(shape), **place)
+
+
+def random_grid(shape=(4, 5, 3), **place):
+    spec = GridSpec(shape, **place)
+    random = np.random.default_rng(0)
+    return IlluminationGrid(spec, random.random((*shape, 3)), random.random(shape), np.ones(shape))
+
+
+# Where the nodes lie
+
+
+@pytest.mark.parametrize(
+    "voxels, longest, nodes",
+    [
+        ((10, 10, 10), 10, (10, 10, 10)),
+        ((10, 10, 10), 4, (4, 4, 4)),
+        ((10, 10, 10), 25, (25, 25, 25)),
+        ((124, 160, 140), 160, (124, 160, 140)),
+        ((124, 160, 140), 128, (99, 128, 112)),  # 1 + round(98.245), 1 + round(111.03)
+        ((409, 415, 119), 128, (126, 128, 37)),  # 1 + round(125.16), 1 + round(36.20)
+        ((2, 100, 3), 2, (2, 2, 2)),
+        ((2, 200, 30), 20, (2, 20, 4)),
+        ((3, 5, 7), 4, (2, 3, 4)),
+        ((2, 5, 3), 4, (2, 4, 3)),  # 1 + round(0.75), 1 + round(1.5): halves go up
+        ((6, 11, 2), 6, (4, 6, 2)),  # 1 + round(2.5): halves go up
+        ((2, 2, 2), 5, (5, 5, 5)),
+    ],
+)
+def test_the_longest_axis_gets_the_nodes_asked_for_and_the_others_in_proportion(voxels, longest, nodes):
+    assert GridSpec.over(volume(voxels), longest).shape == nodes
+
+
+@pytest.mark.parametrize("voxels", [(10, 7, 4), (2, 2, 2), (5, 2, 9)])
+@pytest.mark.parametrize("direction", DIRECTIONS.values(), ids=DIRECTIONS)
+def test_as_many_nodes_as_voxels_are_the_voxels_to_the_last_bit(voxels, direction):
+    place = volume(voxels, origin=(1 / 3, -1e5, 7), spacing=UNEVEN / 3, direction=direction)
+    spec = GridSpec.over(place, max(voxels))
+    assert spec.shape == voxels
+    for name in ("origin", "spacing", "direction"):
+        assert np.array_equal(getattr(spec, name), getattr(place, name))
+    index = np.indices(voxels).reshape(3, -1).T
+    assert np.array_equal(spec.nodes(), index_to_world(place, index))
+
+
+@pytest.mark.parametrize("longest", [2, 5, 13, 40])
+def test_nodes_reach_from_the_first_to_the_last_voxel_centre(longest):
+    place = volume((9, 14, 5), origin=(1, 2, 3), spacing=UNEVEN, direction=MIRRORED)
+    spec = GridSpec.over(place, longest)
+    nodes = spec.nodes()
+    np.testing.assert_allclose(nodes[0], place.origin, atol=1e-12)
+    np.testing.assert_allclose(nodes[-1], index_to_world(place, [8, 13, 4]), atol=1e-12)
+
+
+def test_nodes_are_numbered_in_c_order():
+    spec = GridSpec((2, 3, 4), (1, 2, 3), UNEVEN)
+    assert spec.nodes(np.array([0, 1, 4, 12, 23])).tolist() == [
+        [1, 2, 3], [1, 2, 6], [1, 3.25, 3], [1.5, 2, 3], [1.5, 4.5, 12],
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("shape", [(1, 3, 3), (3, 3), (0, 2, 2)])
+def test_a_grid_of_too_few_nodes_is_refused(shape):
+    refused(lambda: GridSpec(shape), str(shape), "at least 2")
+
+
+def test_a_grid_of_one_node_along_the_longest_axis_is_refused():
+    for count in (1, 0, -4):
+        refused(lambda count=count: GridSpec.over(volume((3, 3, 3)), count), f"{count} nodes", "at least 2")
+
+
+def test_a_grid_takes_only_arrays_of_its_shape():
+    spec, ones = GridSpec((2, 3, 4)), np.ones((2, 3, 4))
+    refused(lambda: IlluminationGrid(spec, ones, ones, ones), "values", "(2, 3, 4)", "(2, 3, 4, 3)")
+    refused(lambda: IlluminationGrid(spec, np.ones((2, 3, 4, 3)), ones[1:], ones), "error", "(1, 3, 4)")
+    refused(lambda: IlluminationGrid(spec, np.ones((2, 3, 4, 3)), ones, ones.T), "support", "(4, 3, 2)")
+    refused(lambda: GridSpec((2, 2, 2), spacing=(1, 0, 1)), "spacing")
+
+
+# Lookup
+
+
+@pytest.mark.parametrize("direction", DIRECTIONS.values(), ids=DIRECTIONS)
+@pytest.mark.parametrize("origin", [(0, 0, 0), (1e5, -2e5, 0.1)])
+def test_a_lookup_at_a_node_returns_the_node(direction, origin):
+    grid = random_grid(origin=origin, spacing=UNEVEN / 3, direction=direction)
+    assert np.array_equal(grid.lookup(grid.spec.nodes()), grid.values.reshape(-1, 3))
+
+
+def test_a_lookup_in_the_middle_of_a_cell_is_the_mean_of_its_corners():
+    grid = random_grid(spacing=UNEVEN, direction=MIRRORED)
+    middle = index_to_world(grid.spec, [[1.5, 2.5, 0.5], [0.5, 0, 2]])
+    expected = [grid.values[1:3, 2:4, 0:2].mean(axis=(0, 1, 2)), grid.values[0:2, 0, 2].mean(axis=0)]
+    np.testing.assert_allclose(grid.lookup(middle), expected, rtol=1e-6)
+
+
+def test_light_that_is_linear_in_space_is_read_exactly():
+    spec = GridSpec((4, 5, 6), (1, 2, 3), UNEVEN, MIRRORED)
+    slopes = np.random.default_rng(0).normal(size=(3, 3))
+    values = (spec.nodes() @ slopes).reshape(4, 5, 6, 3)
+    grid = IlluminationGrid(spec, values, np.zeros((4, 5, 6)), np.ones((4, 5, 6)))
+    points = index_to_world(spec, np.random.default_rng(1).random((100, 3)) * [3, 4, 5])
+    np.testing.assert_allclose(grid.lookup(points), points @ slopes, atol=1e-5)
+    assert grid.lookup(points).dtype == np.float32
+
+
+def test_beyond_the_border_the_light_is_that_of_the_border():
+    grid = random_grid()
+    points = np.random.default_rng(0).uniform(-20, 20, (200, 3))
+    clamped = np.clip(points, 0, np.array(grid.spec.shape) - 1)
+    np.testing.assert_allclose(grid.lookup(points), grid.lookup(clamped), atol=1e-6)
+
+
+def test_a_lookup_is_never_nan():
+    grid = random_grid()
+    bad = [np.nan, np.inf, -np.inf, 1e300, -1e300, 1.0]
+    points = np.array(np.meshgrid(bad, bad, bad)).reshape(3, -1).T
+    light = grid.lookup(points)
+    assert np.isfinite(light).all() and light.min() >= 0 and light.max() <= 1
+    assert grid.lookup(np.zeros((0, 3))).shape == (0, 3)
+    assert grid.lookup([1.0, 2.0, 1.0]).shape == (1, 3)
+
+
+def test_any_number_of_channels_is_read():
+    spec = GridSpec((2, 2, 2))
+    values = np.arange(40, dtype=np.float32).reshape(2, 2, 2, 5)
+    assert read_lattice(spec, values, [[1, 0, 1]]).tolist() == [values[1, 0, 1].tolist()]
+
+
+# Holes
+
+
+def test_a_hole_takes_the_value_of_the_nearest_supported_node_in_the_world():
+    spec = GridSpec((6, 5, 4), spacing=UNEVEN)
+    random = np.random.default_rng(0)
+    values = random.random((6, 5, 4, 3)).astype(np.float32)
+    support = (random.random((6, 5, 4)) < 0.2).astype(np.float32)
+    filled = fill_holes(spec, values, support).reshape(-1, 3)
+    nodes, good = spec.nodes(), support.ravel() > 0
+    apart = np.linalg.norm(nodes[:, None] - nodes[good][None], axis=2)
+    for node in range(len(nodes)):
+        candidates = values.reshape(-1, 3)[good][apart[node] <= apart[node].min() + 1e-9]
+        assert (candidates == filled[node]).all(axis=1).any()
+    assert np.array_equal(filled[good], values.reshape(-1, 3)[good])
+
+
+@pytest.mark.parametrize("support", [0.0, 1.0])
+def test_all_or_no_support_leaves_the_values(support):
+    spec = GridSpec((2, 3, 4))
+    values = np.random.default_rng(0).random((2, 3, 4, 3)).astype(np.float32)
+    assert np.array_equal(fill_holes(spec, values, np.full((2, 3, 4), support, np.float32)), values)
