@@ -113,7 +113,8 @@ def test_paths_from_a_block_are_those_of_its_faces():
     # Solid from border to border: whatever is hit from outside is a cap, and both fields have some.
     i, j, _ = np.indices((4, 5, 6))
     tall = Field("tall", Volume(i), Material(ALBEDO, EMISSION), (0.5, 2.5))
-    wide = Field("wide", Volume(j, origin=(4.0, -2.0, 1.0), spacing=(1, 1.5, 1)), Material(EMISSION), (0.5, 3.5), "below")
+    beside = Volume(j, origin=(4.0, -2.0, 1.0), spacing=(1, 1.5, 1))
+    wide = Field("wide", beside, Material(EMISSION), (0.5, 3.5), "below")
     scene = Scene((tall, wide), (1.0, 0.9, 0.6))
     queries = everywhere(scene)[::9]
     caps = 0

@@ -90,12 +90,12 @@ def test_points_outside_the_volume_are_holes_that_stay_where_they_are():
 
 
 def test_points_on_a_plateau_or_far_from_their_level_are_holes():
-    values = np.zeros((10, 5, 5))
-    values[5:] = np.arange(5)[:, None, None]
-    scene = sky(Volume(values), (0.5, 3))
+    values = np.zeros((14, 5, 5))
+    values[5:] = np.arange(9)[:, None, None]
+    scene = sky(Volume(values), (0.5, 7))
     points = np.array([[1.5, 2, 2], [7.5, 2, 2], [7.5, 2, 2]])
     assert is_hole(Queries.at(scene, points)).tolist() == [True, False, False]
-    queries = Queries.at(scene, points, level=[0.5, 2.75, 0.5])
+    queries = Queries.at(scene, points, level=[0.5, 2.75, 6.5])
     assert is_hole(queries).tolist() == [True, False, True]
     assert np.array_equal(queries.point[[0, 2]], points[[0, 2]])
 

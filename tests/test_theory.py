@@ -7,11 +7,22 @@ import pytest
 
 from illumgrid.backends.numba_ import Numba
 from illumgrid.backends.reference import Reference
-from illumgrid.samples import Queries, combine
-from illumgrid.scene import Field, Material, Scene
+from illumgrid.samples import combine
+from illumgrid.scene import Scene
 from illumgrid.volume import Volume, cell_gradient, outward_normals, smooth, world_to_index
 from transport import (
-    ALBEDO, assert_standard_normal, colored, everywhere, furnace, linear, noise, on_sets, on_voxels, rotation, sidak, waves, worth,
+    ALBEDO,
+    assert_standard_normal,
+    colored,
+    everywhere,
+    furnace,
+    linear,
+    noise,
+    on_sets,
+    on_voxels,
+    rotation,
+    waves,
+    worth,
 )  # fmt: skip
 
 BACKENDS = {"numba": Numba(), "reference": Reference()}
@@ -65,21 +76,24 @@ def test_a_linear_field_gathers_pi_on_every_path(slopes, inside, backend):
 
 
 def paraboloid(n=15, spacing=(1.0, 1.0, 1.0)):
-    """h = -|x|²: between voxels a sum of three concave functions, each linear in every cell, so each solid is a polyhedron
-    that is convex exactly, with one facet a cell; far from the border its level sets are closed."""
+    """h = -|x|²: between voxels a sum of three concave functions, each linear in every cell.
+
+    So each solid is a polyhedron that is convex exactly, with one facet a cell.
+    """
     axes = np.ogrid[:n, :n, :n]
-    return Volume(-sum(((2 * a - n + 1) * s) ** 2 for a, s in zip(axes, spacing)), spacing=spacing, direction=rotation())
+    values = -sum(((2 * a - n + 1) * s) ** 2 for a, s in zip(axes, spacing))
+    return Volume(values, spacing=spacing, direction=rotation())
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("bounces", [0, 1, 5])
 def test_a_convex_body_loses_only_what_dips_under_its_facets(bounces, backend):
-    # About the gradient normal n, a share q = (1 - n·g)/2 of the directions dips under the facet with normal g; each such
-    # direction is one more reflection at the same place: E = π (1 - q) Σ (a q)^k. What has left never comes back.
+    # About the gradient normal n, a share q = (1 - n·g)/2 of the directions dips under the facet with normal g; each
+    # is one more reflection at the same place: E = π (1 - q) Σ (a q)^k. What has left never comes back.
     albedo = 0.6
     volume = paraboloid(spacing=(1.0, 1.2, 0.8))
     scene = Scene.sky(volume, [albedo] * 3, (-90, -20))
-    queries = on_sets(scene, count=6, points=400)
+    queries = on_sets(scene, count=6, points=400)[:: 1 if backend == "numba" else 5]
     paths = range(400 if backend == "numba" else 24)
     answer = BACKENDS[backend].solve(scene, queries, paths=paths, bounces=bounces, seed=1)
     assert (answer.paths == len(paths)).all()
@@ -92,67 +106,50 @@ def test_a_convex_body_loses_only_what_dips_under_its_facets(bounces, backend):
     truth = (chance * albedo**k).sum(axis=1)
     variance = (chance * albedo ** (2 * k)).sum(axis=1) - truth**2
     off = answer.mean[:, 0].astype(float) / math.pi - truth
-    expected = len(paths) * q[:, 0]
-    assert q.mean() < 0.02  # a sphere within a few percent of π already
-    some = expected > 5  # enough dips for a normal distribution
-    assert some.sum() > (50 if backend == "numba" else -1)
-    if some.any():
-        assert np.abs(off[some] / np.sqrt(variance[some] / len(paths))).max() < 1.3 * sidak(some.sum())
-    together = off.sum() / np.sqrt(variance.sum() / len(paths))
-    assert abs(together) < sidak(1)
+    # Dips are rare: groups of queries with similar q, so that their sums are normal.
+    groups = np.array_split(np.argsort(q[:, 0]), 20 if backend == "numba" else 2)
+    assert_standard_normal([off[g].sum() / np.sqrt(variance[g].sum() / len(paths)) for g in groups])
+    assert 0.99 * math.pi < answer.mean.mean() < math.pi  # a sphere's π, but for its facets
 
 
-def test_a_voxel_of_a_convex_body_sees_the_sky_outside_its_corner():
-    # On a voxel eight facets meet. Without bounces, and with the smooth normal, E is the share of directions outside all.
-    volume = paraboloid()
-    scene = Scene.sky(volume, [0.5] * 3, (-90, -20))
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("inside", ["above", "below"])
+def test_a_voxel_of_a_convex_body_gathers_pi_on_every_path(inside, backend):
+    # Eight facets meet there, and central differences are a mean of their slopes: of a concave field, a normal that has
+    # all of the solid on one side. Whoever asks one of the eight cells which side a direction is on loses light here.
+    volume = paraboloid(9)
+    if inside == "below":
+        volume = volume.with_values(-volume.values)
+    scene = Scene.sky(volume, [0.5] * 3, sorted([volume.values.min(), volume.values.max()]), inside)
     queries = on_voxels(scene)
-    queries = queries[(queries.level[:, 0] > -90) & (queries.level[:, 0] < -20)]
-    answer = Numba().solve(scene, queries, paths=range(2000), bounces=0, seed=2)
-    index = np.round(world_to_index(volume, queries.point)).astype(int)
-    rng = np.random.default_rng(3)
-    u1, u2 = rng.random((2, 40000))
-    along, around = np.sqrt(1 - u1), np.sqrt(u1) * np.exp(2j * np.pi * u2)
-    z = []
-    for row, (i, normal) in enumerate(zip(index, queries.normal @ volume.direction)):
-        if row % 7:
-            continue
-        e1 = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
-        e1 /= np.linalg.norm(e1)
-        d = np.outer(around.real, e1) + np.outer(around.imag, np.cross(normal, e1)) + np.outer(along, normal)
-        h = volume.values
-        rise = np.zeros(len(d))
-        for axis, step in enumerate(np.eye(3, dtype=int)):  # the cell that the direction enters decides each slope
-            ahead, behind = h[tuple(i + step)] - h[tuple(i)], h[tuple(i)] - h[tuple(i - step)]
-            rise += d[:, axis] * np.where(d[:, axis] > 0, ahead, behind)
-        truth = (rise <= 0).mean()
-        z.append((answer.mean[row, 0] / math.pi - truth) / math.sqrt(truth * (1 - truth) * (1 / 2000 + 1 / 40000)))
-    assert_standard_normal(z)
+    answer = BACKENDS[backend].solve(scene, queries, paths=range(100 if backend == "numba" else 4), bounces=2, seed=2)
+    assert answer.paths.all()
+    np.testing.assert_allclose(answer.mean, math.pi, rtol=1e-6)
+
+
+WALL = 300.0
 
 
 def cavity(values, **placement):
-    """Everything at the border and beyond is shut in: no level set reaches the outside."""
-    values = np.array(values, np.float32)
-    wall = np.ones(values.shape, bool)
-    wall[1:-1, 1:-1, 1:-1] = False
-    values[wall] = values.max() + 1
-    return Volume(values, **placement)
+    """Shut in by voxels that are solid at all levels below WALL: none of those level sets reaches the outside."""
+    return Volume(np.pad(np.asarray(values, np.float32), 1, constant_values=WALL), **placement)
 
 
-def sealed(volume, inside="above"):
-    """Mirrors all over, and light only outside."""
-    low, high = float(volume.values.min()), float(volume.values.max())
-    field = Field("cavity", volume, Material((1, 1, 1)), (low - 0.5, high - 0.5) if inside == "above" else (low + 0.5, high + 0.5))
-    return Scene((Field(field.name, field.volume, field.material, field.range, inside),), np.ones(3))
+def sealed(volume, inside="above", high=256.0):
+    """Mirrors all over, light only outside; and queries on voxels and level sets within."""
+    limits = (-0.5, high) if inside == "above" else (-high, 0.5)
+    scene = Scene.sky(volume, (1, 1, 1), limits, inside)
+    queries = everywhere(scene)
+    return scene, queries[np.abs(queries.level[:, 0]) < WALL]
 
 
 RNG = np.random.default_rng(11)
 CAVITIES = {
-    "two grays": RNG.integers(0, 2, (12, 13, 14)),
-    "four grays": RNG.integers(0, 4, (12, 13, 14)),
-    "bytes": RNG.integers(0, 256, (14, 12, 13)),
-    "reals": RNG.random((13, 14, 12)),
-    "one bubble": np.linalg.norm(np.indices((13, 13, 13)) - np.array([6.2, 5.9, 6.0])[:, None, None, None], axis=0),
+    "two grays": RNG.integers(0, 2, (10, 11, 12)),
+    "four grays": RNG.integers(0, 4, (10, 11, 12)),
+    "bytes": RNG.integers(0, 256, (12, 10, 11)),
+    "reals": RNG.random((11, 12, 10)),
+    "one bubble": np.linalg.norm(np.indices((11, 11, 11)) - np.array([5.2, 4.9, 5.0])[:, None, None, None], axis=0),
 }
 
 
@@ -161,27 +158,22 @@ CAVITIES = {
 @pytest.mark.parametrize("name", CAVITIES)
 def test_no_light_leaks_into_a_sealed_cavity(name, scale, extents):
     spacing = scale * np.array([1.0, 0.7, 1.9])
-    volume = cavity(CAVITIES[name], spacing=spacing, origin=extents * 14 * spacing.max() * np.array([1, -1, 1]), direction=rotation())
-    inside = "above"
-    if name == "bytes":
+    origin = extents * 13 * spacing.max() * np.array([1, -1, 1])
+    volume, inside = cavity(CAVITIES[name], spacing=spacing, origin=origin, direction=rotation()), "above"
+    if scale == 1e6:
         volume, inside = volume.with_values(-volume.values), "below"
-    scene = sealed(volume, inside)
-    queries = everywhere(scene)
-    queries = queries[(np.abs(world_to_index(volume, queries.point) - (np.array(volume.shape) - 1) / 2) < (np.array(volume.shape) - 3) / 2 + 0.5).all(axis=1)]
+    scene, queries = sealed(volume, inside, high=CAVITIES[name].max())
     assert len(queries) > 1000
     answer = Numba().solve(scene, queries, paths=range(40000 // len(queries) + 1), bounces=6, seed=4)
     assert (answer.paths > 0).mean() > 0.9
     assert not answer.mean.any(), f"{(answer.mean.any(axis=1)).sum()} of {len(queries)} queries see the sky"
 
 
-def test_a_million_paths_stay_in_a_sealed_cavity():
-    scene = sealed(cavity(CAVITIES["four grays"]))
-    queries = everywhere(scene)
-    interior = (np.abs(queries.point - [5.5, 6.0, 6.5]) < [5.0, 5.5, 6.0]).all(axis=1)
-    queries = queries[interior]
-    paths = range(1_000_000 // len(queries) + 1)
-    for backend, some in ((Numba(), paths), (Reference(), range(4))):
-        answer = backend.solve(scene, queries, paths=some, bounces=3, seed=0)
+@pytest.mark.parametrize("name", ["four grays", "reals"])
+def test_a_million_paths_stay_in_a_sealed_cavity(name):
+    scene, queries = sealed(cavity(CAVITIES[name]), high=CAVITIES[name].max())
+    for backend, paths in ((Numba(), 1_000_000 // len(queries) + 1), (Reference(), 1)):
+        answer = backend.solve(scene, queries, paths=range(paths), bounces=3, seed=0)
         assert not answer.mean.any()
 
 
@@ -192,7 +184,7 @@ def test_bars_are_honest():
     queries = on_voxels(scene)
     queries = queries[(queries.level[:, 0] > low) & (queries.level[:, 0] < high)]
     assert len(queries) >= 1000
-    truth = Numba().solve(scene, queries, paths=range(1000, 5000), bounces=4, seed=0)
+    truth = Numba().solve(scene, queries, paths=range(1000, 3000), bounces=4, seed=0)
     answer = Numba().solve(scene, queries, paths=range(256), bounces=4, seed=0)
     off = answer.mean.astype(float) - truth.mean
     bar = np.hypot(answer.stderr, truth.stderr)
@@ -206,13 +198,12 @@ def test_bars_are_honest():
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_ranges_of_paths_combine_to_one(backend):
     scene = colored(FURNACES["two fields"]())
-    queries = everywhere(scene)[::5]
+    queries = everywhere(scene)[::40]
     solve = BACKENDS[backend].solve
     whole = solve(scene, queries, paths=range(3, 40), bounces=2, seed=0)
-    parts = [solve(scene, queries, paths=r, bounces=2, seed=0) for r in (range(3, 4), range(4, 4), range(4, 17), range(17, 40))]
-    together = parts[0]
-    for part in parts[1:]:
-        together = combine(together, part)
+    together = solve(scene, queries, paths=range(3, 4), bounces=2, seed=0)
+    for more in (range(4, 4), range(4, 17), range(17, 40)):
+        together = combine(together, solve(scene, queries, paths=more, bounces=2, seed=0))
     np.testing.assert_array_equal(together.paths, whole.paths)
     np.testing.assert_allclose(together.mean, whole.mean, atol=1e-6)
     np.testing.assert_allclose(together.m2, whole.m2, atol=2e-5)
@@ -239,6 +230,5 @@ def test_the_normal_of_a_query_is_the_gradient_normal_in_the_world():
     scene = furnace(noise(9, direction=rotation() @ np.diag([1, 1, -1]), spacing=(1.0, 0.7, 1.9)), inside="below")
     volume = scene.fields[0].volume
     queries = on_voxels(scene)
-    assert isinstance(queries, Queries)
     expected = outward_normals(volume, world_to_index(volume, queries.point), "below") @ volume.direction.T
     np.testing.assert_allclose(queries.normal, expected, atol=1e-15)

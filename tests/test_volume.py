@@ -21,6 +21,7 @@ from illumgrid.volume import (
 )
 from shapes import DIRECTIONS, MIRRORED, ball, refused, sampled
 
+REACH = 3.0  # cells
 UNEVEN = np.array([0.5, 1.25, 3.0])
 
 
@@ -274,7 +275,6 @@ def test_projection_reaches_every_near_level_of_a_smooth_field():
     at, arrived = project(volume, start, level)
     assert arrived.all()
     assert misses(volume, at, level).max() < 1e-9 * 0.1
-    assert np.abs(at - start).max() <= 1
 
 
 @pytest.mark.parametrize("scale", [1e-30, 1, 1e30])
@@ -285,7 +285,7 @@ def test_projection_on_noise_never_says_arrived_where_it_is_not(scale):
     at, arrived = project(volume, start, level)
     assert arrived.mean() > 0.9
     assert misses(volume, at, level)[arrived].max() < 1e-8 * scale
-    assert np.abs(at - start)[arrived].max() <= 1
+    assert np.abs(at - start)[arrived].max() <= REACH
     assert (at >= 0).all() and (at <= np.array(volume.shape) - 1).all()
 
 
@@ -297,11 +297,11 @@ def test_a_point_on_its_own_level_stays_where_it_is():
 
 
 def test_projection_does_not_arrive_on_a_plateau_out_of_reach_or_from_outside():
-    values = np.zeros((8, 4, 4))
-    values[5:] = np.arange(3)[:, None, None] * 10
+    values = np.zeros((14, 4, 4))
+    values[5:] = np.arange(9)[:, None, None] * 10
     volume = Volume(values)
     start = np.array([[2, 1.5, 1.5], [5.5, 1, 1], [5.5, 1, 1], [5.5, 1, 1], [-0.5, 1, 1], [5.5, 1, 3.2]])
-    level = np.array([3.0, 7.0, 19.0, 100.0, 0.0, 5.0])
+    level = np.array([3.0, 7.0, 45.0, 100.0, 0.0, 5.0])
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         at, arrived = project(volume, start, level)

@@ -105,10 +105,12 @@ def bake(
     clock.append(time.perf_counter())
 
     grids = []
+    del batches
     for number, spec in enumerate(specs):
-        own = [a[a.queries.target == number] for a in answers if (a.queries.target == number).any()]
-        samples = join_samples(own) if own else _no_samples(scene)
+        samples = _of_field(scene, answers, number)
+        answers = [a for a in answers if (a.queries.target != number).any()]  # a large run is held once, not twice
         grids.append(interpolator.fill(samples, spec, number))
+        del samples
         progress("grid", number + 1, len(specs))
     clock.append(time.perf_counter())
     return Baked(
@@ -119,6 +121,9 @@ def bake(
     )
 
 
-def _no_samples(scene: Scene) -> Samples:
+def _of_field(scene: Scene, answers: Sequence[Samples], number: int) -> Samples:
+    own = [a if (a.queries.target == number).all() else a[a.queries.target == number] for a in answers]
+    if own := [a for a in own if len(a)]:
+        return join_samples(own)
     rgb = np.zeros((0, 3), np.float32)
     return Samples(Queries.at(scene, np.zeros((0, 3))), rgb, rgb, np.zeros(0, np.int32))

@@ -44,7 +44,7 @@ def suggest_range(volume: Volume, inside: Side = "above") -> tuple[float, float,
     Returns
     -------
     low, high : float
-        Otsu's threshold parts background from object; the other end leaves the inmost quarter of the object inside.
+        Otsu's threshold parts background from object; the other end leaves the inmost half of the object inside.
         With `inside` "below" the same is done for -h.
     why : str
         One sentence that says so, with the numbers.
@@ -60,20 +60,26 @@ def suggest_range(volume: Volume, inside: Side = "above") -> tuple[float, float,
     """
     from skimage.filters import threshold_otsu
 
+    lowest, highest = float(np.nanmin(volume.values)), float(np.nanmax(volume.values))
+    if not (np.isfinite(lowest) and np.isfinite(highest)):
+        volume = finite(volume, inside)
+        lowest, highest = float(volume.values.min()), float(volume.values.max())
+    if lowest == highest:
+        raise BadInput(f"the values are all {lowest:g}; expected a field that varies, or there is no isosurface")
+    counts, edges = np.histogram(volume.values, 1024, (lowest, highest))
+    depth = 0.5 * (edges[1:] + edges[:-1])
+    if inside == "below":
+        counts, depth = counts[::-1], -depth[::-1]
     sign = 1.0 if inside == "above" else -1.0
-    depth = sign * volume.values[np.isfinite(volume.values)].astype(float)
-    if depth.min() == depth.max():
-        raise BadInput(f"the values are all {sign * depth.min():g}; expected a field that varies, or there is no isosurface")
-    threshold = float(threshold_otsu(depth))
-    within = depth[depth > threshold]
-    deep = float(np.quantile(within, 0.75))
-    if deep <= threshold:
-        deep = float(within.max())
-    share = within.size / depth.size
+    threshold = float(threshold_otsu(hist=(counts, depth)))
+    within = np.where(depth > threshold, counts, 0)
+    # The bin at which half of the object is passed; at least one bin deeper than the threshold.
+    deep = float(depth[max(np.searchsorted(np.cumsum(within), 0.5 * within.sum()), np.searchsorted(depth, threshold) + 1)])
+    share = within.sum() / counts.sum()
     low, high = sorted((sign * threshold, sign * deep))
     why = (
         f"Otsu's threshold {sign * threshold:.4g} parts the object ({share:.1%} of the voxels) from the background, "
-        f"and a quarter of the object lies {'above' if inside == 'above' else 'below'} {sign * deep:.4g}"
+        f"and half of the object lies {'above' if inside == 'above' else 'below'} {sign * deep:.4g}"
     )
     return low, high, why
 

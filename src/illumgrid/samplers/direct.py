@@ -18,12 +18,12 @@ from illumgrid.volume import interpolate, world_to_index
 _BATCH = 1 << 14
 
 
-def _pairwise(values: NDArray[np.float32], extreme: np.ufunc) -> NDArray[np.float32]:
-    """Extreme over the 8 corners of every cell."""
+def _any_corner(voxels: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Cells with a marked voxel among their 8 corners."""
     for axis in range(3):
-        line = np.moveaxis(values, axis, 0)
-        values = np.moveaxis(extreme(line[1:], line[:-1]), 0, axis)
-    return values
+        line = np.moveaxis(voxels, axis, 0)
+        voxels = np.moveaxis(line[1:] | line[:-1], 0, axis)
+    return voxels
 
 
 def reachable(field: Field, spec: GridSpec) -> NDArray[np.int64]:
@@ -31,9 +31,8 @@ def reachable(field: Field, spec: GridSpec) -> NDArray[np.int64]:
 
     They are the corners of all grid cells that overlap a voxel cell which some level set within the range crosses.
     """
-    volume = field.volume
-    crossed = _pairwise(volume.values, np.maximum) >= field.range[0]
-    crossed &= _pairwise(volume.values, np.minimum) <= field.range[1]
+    values = field.volume.values
+    crossed = _any_corner(values >= field.range[0]) & _any_corner(values <= field.range[1])
     for axis in range(3):
         line = np.moveaxis(crossed, axis, 0)
         voxel_cells, grid_cells = len(line), spec.shape[axis] - 1

@@ -1,0 +1,298 @@
+"""The command line in process: every command and option, exit codes, and refusals in one sentence."""
+
+import json
+
+import numpy as np
+import pytest
+import typer
+from PIL import Image
+
+import illumgrid as ig
+from illumgrid import cli, preview
+from illumgrid.errors import BadInput
+from shapes import MIRRORED, ball, sampled
+
+QUICK = ("--grid", "8", "--paths", "2", "--bounces", "1")
+RANGE = ("--range", "0.3", "0.9")
+
+
+@pytest.fixture(autouse=True)
+def small_pictures(monkeypatch):
+    monkeypatch.setattr(preview.render, "__kwdefaults__", {"width": 64, "height": 48, "local": False})
+
+
+@pytest.fixture
+def call(capsys, tmp_path, monkeypatch):
+    """Run a command in a folder of its own; returns what it said."""
+    monkeypatch.chdir(tmp_path)
+    np.save(tmp_path / "v.npy", ball(10).values)
+
+    def call(*args, code=0):
+        result = cli.guarded(lambda: cli.app([str(a) for a in args], standalone_mode=False))
+        said = "".join(capsys.readouterr())
+        assert result == code, said
+        assert "Traceback" not in said
+        return said
+
+    return call
+
+
+@pytest.fixture
+def refuse(call, tmp_path):
+    """A command is refused in one sentence with these words, and nothing is written."""
+
+    def refuse(*args, words):
+        before = sorted(tmp_path.rglob("*"))
+        said = call(*args, code=2).strip()
+        assert said.count("\n") == 0 and said.startswith("illumgrid: ") and ". " not in said, said
+        for word in words:
+            assert word in said, said
+        assert sorted(tmp_path.rglob("*")) == before
+
+    return refuse
+
+
+def recipe(folder):
+    return json.loads((folder / "run.json").read_text())["recipe"]
+
+
+# run
+
+
+def test_a_run_leaves_light_a_record_and_a_picture(call, tmp_path):
+    said = call("run", "v.npy", *RANGE, *QUICK, "-o", "deep/out")
+    assert "10 x 10 x 10 voxels" in said and "0.3 to 0.9" in said and "wrote deep/out" in said and "queries x 2 paths" in said
+    out = tmp_path / "deep" / "out"
+    assert sorted(p.name for p in out.iterdir()) == ["illumination.exr", "preview.png", "run.json"]
+    assert Image.open(out / "preview.png").size == (64, 48)
+    made = recipe(out)
+    assert made["input"] == "v.npy" and made["smooth"] == 0 and made["warnings"] == [] and made["exposure"] > 0
+    light = ig.load(out)
+    scene = ig.Scene.sky(ig.read_volume(tmp_path / "v.npy"), range=(0.3, 0.9), name="v")
+    assert np.array_equal(light.grids[0].values, ig.run(scene, grid=8, paths=2, bounces=1).grids[0].values)
+
+
+def test_without_options_the_folder_is_named_after_the_input_and_the_range_comes_from_the_data(call, tmp_path):
+    call("run", "v.npy", *QUICK, "--no-preview")
+    assert sorted(p.name for p in (tmp_path / "v-light").iterdir()) == ["illumination.exr", "run.json"]
+    field = ig.load(tmp_path / "v-light").scene.fields[0]
+    assert field.name == "v" and field.inside == "above" and field.material.albedo.tolist() == [0.8] * 3
+    assert tuple(field.range) == ig.suggest_range(field.volume)[:2]
+
+
+def test_a_finished_run_is_kept_unless_it_may_be_replaced(call, refuse, tmp_path):
+    call("run", "v.npy", *RANGE, *QUICK, "--no-preview", "-o", "out")
+    refuse("run", "v.npy", *RANGE, *QUICK, "-o", "out", words=["out", "finished run", "--overwrite"])
+    call("run", "v.npy", *RANGE, *QUICK, "--no-preview", "-o", "out", "--overwrite", "--seed", "5")
+    assert recipe(tmp_path / "out")["seed"] == 5
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "thesis.tex").touch()
+    refuse("run", "v.npy", *QUICK, "-o", "mine", "--overwrite", words=["mine", "thesis.tex", "-o"])
+
+
+def test_ranges_may_be_negative_and_the_solid_below(call, tmp_path):
+    lobes = sampled(lambda x: x[:, 0] * np.exp(-(x**2).sum(axis=1)), (12, 12, 12), (-2, -2, -2), (4 / 11,) * 3)
+    np.save(tmp_path / "lobes.npy", lobes.values)
+    call("run", "lobes.npy", "--range", "-0.3", "-0.1", "--inside", "below", *QUICK, "--no-preview", "-o", "out")
+    light = ig.load(tmp_path / "out")
+    assert light.scene.fields[0].range.tolist() == [-0.3, -0.1] and light.scene.fields[0].inside == "below"
+    call("preview", "out", "--isovalue", "-0.2", "-o", "lobe.png")
+    assert len(np.unique(np.asarray(Image.open(tmp_path / "lobe.png")))) > 10
+
+
+def test_material_smoothing_seed_and_depth_are_as_told(call, tmp_path):
+    call("run", "v.npy", *RANGE, "--grid", "6", "--paths", "3", "--bounces", "2", "--seed", "9", "--albedo", "0.1", "0.2", "0.3",
+         "--smooth", "1.5", "--no-preview", "-o", "out")  # fmt: skip
+    made, light = recipe(tmp_path / "out"), ig.load(tmp_path / "out")
+    assert {k: made[k] for k in ("grid", "paths", "bounces", "seed", "smooth")} == {
+        "grid": 6, "paths": 3, "bounces": 2, "seed": 9, "smooth": 1.5,
+    }  # fmt: skip
+    assert light.scene.fields[0].material.albedo.tolist() == [0.1, 0.2, 0.3]
+    assert light.scene.fields[0].volume.values.max() < ball(10).values.max() - 0.05  # stored as used
+
+
+def test_options_of_stages_are_set_one_by_one_and_go_before_those_of_the_run(call, tmp_path):
+    call("run", "v.npy", *RANGE, *QUICK, "--sampler", "uniform", "--isovalues", "4", "--threads", "1", "--no-preview", "-o", "a")
+    made = recipe(tmp_path / "a")
+    assert made["sampler"] == {"name": "uniform", "count": 4, "points": 0} and made["isovalues"] == 4
+    assert made["backend"] == {"name": "numba", "threads": 1}
+    call("run", "v.npy", *RANGE, *QUICK, "--sampler", "uniform", "--isovalues", "4", "--threads", "1", "--no-preview", "-o", "b",
+         "--set", "sampler.count=3", "--set", "sampler.points=100", "--set", "backend.threads=2")  # fmt: skip
+    made = recipe(tmp_path / "b")
+    assert made["sampler"] == {"name": "uniform", "count": 3, "points": 100} and made["isovalues"] == 4
+    assert made["backend"]["threads"] == 2 and made["queries"] == 300
+    call("run", "v.npy", *RANGE, *QUICK, "--sampler", "uniform", "--no-preview", "-o", "c")
+    assert recipe(tmp_path / "c")["sampler"]["count"] == 32
+
+
+def test_threads_do_not_change_the_light_and_the_reference_has_none(call, tmp_path):
+    for name, more in (("one", ("--threads", 1)), ("two", ("--threads", 2)), ("plain", ("--backend", "reference", "--threads", 2))):
+        call("run", "v.npy", *RANGE, "--grid", "5", "--paths", "2", "--bounces", "1", *more, "--no-preview", "-o", name)
+    one, two, plain = (ig.load(tmp_path / name).grids[0].values for name in ("one", "two", "plain"))
+    assert np.array_equal(one, two)
+    np.testing.assert_allclose(plain, one, rtol=1e-5)
+    assert "threads" not in recipe(tmp_path / "plain")["backend"]
+
+
+def test_a_built_in_scene_needs_no_data(call, tmp_path):
+    said = call("run", "--grid", "12", "--paths", "2")
+    assert "protons" in said and "neutrons" in said
+    assert (tmp_path / "nucleus-light" / "preview.png").exists()
+    call("run", "nucleus", "--grid", "6", "--paths", "1", "--no-preview", "-o", "again")
+    assert recipe(tmp_path / "again")["input"] == "nucleus"
+    assert len(ig.load(tmp_path / "again").grids) == 2
+
+
+def test_what_was_noted_during_a_run_is_kept_and_shown_again(call, tmp_path):
+    values = ball(10).values.copy()
+    values[0, 0, 0] = np.nan
+    np.save(tmp_path / "nan.npy", values)
+    assert "note: 1 of 1000 voxels" in call("run", "nan.npy", *RANGE, *QUICK, "--no-preview", "-o", "out")
+    assert "1 of 1000 voxels" in recipe(tmp_path / "out")["warnings"][0]
+    assert "note: 1 of 1000 voxels" in call("info", "out")
+    assert "note: 1 of 1000 voxels" in call("info", "nan.npy")
+
+
+# Refusals
+
+
+@pytest.mark.parametrize(
+    "args, words",
+    [
+        (("nowhere.nrrd",), ["nowhere.nrrd", "no such file"]),
+        (("v.npy", "--range", "5", "1"), ["range", "lower and a higher"]),
+        (("v.npy", "--range", "7", "9"), ["misses its data"]),
+        (("v.npy", "--inside", "left"), ["--inside", "'left'", "above or below"]),
+        (("v.npy", "--albedo", "1", "2", "3"), ["albedo", "0 to 1"]),
+        (("v.npy", "--sampler", "unifrom"), ["sampler", "did you mean 'uniform'?"]),
+        (("v.npy", "--backend", "cuda"), ["backend", "'cuda'", "numba"]),
+        (("v.npy", "--interpolator", "nearst"), ["did you mean 'nearest'?"]),
+        (("v.npy", "--seed", str(2**64)), ["seed", "2**64"]),
+        (("v.npy", "--set", "sampler.count=3"), ["'direct'", "no option 'count'"]),
+        (("v.npy", "--set", "sampler"), ["--set", "'sampler'", "STAGE.OPTION=VALUE"]),
+        (("v.npy", "--set", "samplr.count=3"), ["samplr.count=3", "sampler, backend, interpolator"]),
+        (("v.npy", "--set", "backend.threads=two"), ["backend.threads", "'two'", "whole number"]),
+        (("v.npy", "--sampler", "uniform", "--set", "sampler.count=1"), ["uniform.count is 1", "at least 2"]),
+        (("v.npy", "--smooth", "nan"), ["nan", "from 0 up"]),
+        (("v.npy", "-o", "v.npy"), ["v.npy", "not a folder"]),
+        (("nucleus", "--range", "0", "1"), ["--range", "nucleus", "leave them out"]),
+        (("--inside", "above"), ["--inside", "nucleus"]),
+        (("--albedo", "1", "1", "1"), ["--albedo", "nucleus"]),
+        (("nucleus", "--smooth", "0", "--range", "0", "1"), ["--range, --smooth", "nucleus"]),
+    ],
+)
+def test_bad_input_is_one_sentence_and_leaves_nothing(refuse, args, words):
+    refuse("run", *args, *QUICK, words=words)
+
+
+@pytest.mark.parametrize(
+    "option", [("--paths", 0), ("--bounces", -1), ("--grid", 1), ("--isovalues", 1), ("--seed", -1), ("--threads", 0),
+               ("--smooth", -1), ("--paths", "many"), ("--range", 1), ("--albedo", 1, 1), ("--nonsense",)]
+)  # fmt: skip
+def test_options_out_of_range_are_refused_by_name(call, tmp_path, option):
+    said = call("run", "v.npy", *option, code=2)
+    assert str(option[0]) in said
+    assert [p.name for p in tmp_path.iterdir()] == ["v.npy"]
+
+
+def test_a_scene_that_belongs_to_no_file_is_refused_before_the_folder_is_looked_at(refuse, tmp_path):
+    (tmp_path / "flat.npy").write_bytes(b"")
+    refuse("run", "flat.npy", words=["flat.npy", "empty"])
+    np.save(tmp_path / "flat.npy", np.full((4, 4, 4), 3.0))
+    refuse("run", "flat.npy", *QUICK, words=["all 3", "varies"])
+    refuse("info", "flat.npy", words=["all 3", "varies"]) if False else None
+
+
+# preview and info
+
+
+def test_a_picture_is_drawn_of_the_field_and_isovalue_asked_for(call, tmp_path):
+    call("run", "nucleus", "--grid", "8", "--paths", "2", "--no-preview", "-o", "out")
+    options = {
+        "middle": (), "high": ("--isovalue", "0.7"), "named": ("--field", "neutrons", "--isovalue", "0.7"), "local": ("--local",),
+    }  # fmt: skip
+    pictures = {}
+    for name, more in options.items():
+        said = call("preview", "out", *more, "--output", f"new/{name}.png")
+        assert f"wrote new/{name}.png" in said and ("exposure" in said) == (name != "local")
+        pictures[name] = np.asarray(Image.open(tmp_path / "new" / f"{name}.png"))
+    assert np.array_equal(pictures["high"], pictures["named"])  # both fields have one range
+    assert not np.array_equal(pictures["middle"], pictures["high"])
+    assert not np.array_equal(pictures["middle"], pictures["local"])
+    assert "note: the isovalue 0.9 lies outside the range 0.15 to 0.75" in call("preview", "out", "--isovalue", "0.9", "-o", "x.png")
+
+
+def test_pictures_that_cannot_be_drawn_are_refused(call, refuse, tmp_path):
+    call("run", "v.npy", *RANGE, *QUICK, "--no-preview", "-o", "out")
+    refuse("preview", "out", "-o", "x.jpg", words=["x.jpg", ".png"])
+    refuse("preview", "out", "--field", "w", "-o", "x.png", words=["'w'", "v"])
+    refuse("preview", "nowhere", "-o", "x.png", words=["nowhere", "missing", "illumgrid run"])
+    (tmp_path / "taken.png").mkdir()
+    refuse("preview", "out", "-o", "taken.png", words=["taken.png", "folder"])
+    assert "output" in call("preview", "out", code=2)
+    refuse("preview", "out", "--isovalue", "nan", "-o", "x.png", words=["nan"])
+
+
+def test_info_tells_of_a_volume_what_is_worth_knowing(call, tmp_path):
+    np.savez(tmp_path / "w.npz", values=ball(10).values, origin=(1, 2, 3), spacing=(0.5, 1, 2), direction=MIRRORED)
+    said = call("info", "w.npz")
+    low, high, why = ig.suggest_range(ball(10))
+    for word in ("10 x 10 x 10 voxels", "0.5, 1, 2", "1, 2, 3", "LPS", f"{low:.4g} to {high:.4g}", why):
+        assert word in said
+    line = said.split("|")[1]
+    assert len(line) == 64 and set(line) <= set(cli.BLOCKS) and "█" in line
+
+
+def test_the_histogram_has_blocks_where_there_are_values():
+    values = np.zeros((4, 4, 4))
+    values.flat[:3] = 1, 1, 0.5
+    line = cli.histogram_line(ig.Volume(values), 4)
+    assert line[0] == "█" and line[1] == " " and line[2] in "▁▂▃" and line[3] in "▂▃▄▅"
+
+
+def test_info_tells_of_a_run_what_is_inside(call):
+    call("run", "v.npy", *RANGE, *QUICK, "--seed", "4", "--no-preview", "-o", "out")
+    said = call("info", "out")
+    for word in ("10 x 10 x 10 voxels", "0.3 to 0.9, inside above", "8 x 8 x 8 nodes", "sampler direct", "backend numba",
+                 "interpolator nearest", "2 paths", "1 bounces", "seed 4"):  # fmt: skip
+        assert word in said
+
+
+# The rest
+
+
+def test_the_version_and_the_help_are_told(call):
+    assert call("--version").strip() == f"illumgrid {ig.__version__}"
+    said = call("run", "--help")
+    for option in ("--sampler", "--isovalues", "--range", "--inside", "--backend", "--paths", "--bounces", "--seed", "--grid",
+                   "--interpolator", "--albedo", "--set", "--smooth", "--threads", "--no-preview", "--overwrite", "--output"):  # fmt: skip
+        assert option in said
+    assert "--isovalue" in call("preview", "--help") and "VOLUME" in call("info", "--help")
+    everything = call("--help")
+    assert all(command in everything for command in ("run", "preview", "info"))
+    assert "frobnicate" in call("frobnicate", code=2)
+
+
+@pytest.mark.parametrize(
+    "trouble, code, word",
+    [
+        (KeyboardInterrupt(), 130, "stopped"),
+        (typer.Abort(), 130, "stopped"),
+        (BadInput("what came"), 2, "what came"),
+        (MemoryError(), 2, "memory"),
+        (OSError(28, "No space left on device", "here"), 2, "No space left on device: here"),
+    ],
+)
+def test_trouble_is_an_exit_code_and_a_sentence(capsys, trouble, code, word):
+    def fail():
+        raise trouble
+
+    assert cli.guarded(fail) == code
+    said = capsys.readouterr().err
+    assert said.startswith("illumgrid: ") and word in said and said.count("\n") == 1
+
+
+def test_a_mistake_of_ours_is_not_dressed_up_as_bad_input():
+    with pytest.raises(ZeroDivisionError):
+        cli.guarded(lambda: 1 / 0)
+    assert cli.guarded(lambda: None) == 0 and cli.guarded(lambda: 3) == 3

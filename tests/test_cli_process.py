@@ -1,0 +1,82 @@
+"""The command line as a process: what it imports, and what is left when it is stopped or killed."""
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+import illumgrid as ig
+from shapes import ball
+
+COMMAND = (sys.executable, "-m", "illumgrid")
+
+
+def start(*args, cwd):
+    return subprocess.Popen([*COMMAND, *args], cwd=cwd, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    np.save(tmp_path / "v.npy", ball(12).values)
+    return tmp_path
+
+
+def test_the_module_runs_as_the_command_does(tmp_path):
+    done = subprocess.run([*COMMAND, "--version"], capture_output=True, text=True, cwd=tmp_path)
+    assert (done.returncode, done.stdout.strip(), done.stderr) == (0, f"illumgrid {ig.__version__}", "")
+    done = subprocess.run([*COMMAND, "run", "nowhere.nrrd"], capture_output=True, text=True, cwd=tmp_path)
+    assert done.returncode == 2 and not done.stdout and done.stderr.startswith("illumgrid: nowhere.nrrd: ")
+    assert done.stderr.count("\n") == 1 and not list(tmp_path.iterdir())
+
+
+def test_help_is_quick_because_it_loads_nothing_heavy():
+    code = """
+import sys
+from illumgrid.cli import app
+for args in ([], ["run"], ["preview"], ["info"]):
+    app([*args, "--help"], standalone_mode=False)
+heavy = {"numba", "numpy", "scipy", "skimage", "trimesh", "OpenEXR", "SimpleITK", "PIL"} & set(sys.modules)
+sys.exit(f"loaded {heavy}" if heavy else 0)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert not done.stderr and "--isovalues" in done.stdout
+
+
+@pytest.mark.parametrize("sign", [signal.SIGINT])
+def test_ctrl_c_stops_with_a_sentence_and_leaves_nothing(folder, sign):
+    process = start("run", "v.npy", "--paths", "10000000", "-o", "out", cwd=folder)
+    while "voxels" not in process.stderr.readline():
+        assert process.poll() is None
+    time.sleep(1.5)  # into the kernels
+    process.send_signal(sign)
+    begun = time.monotonic()
+    _, said = process.communicate(timeout=60)
+    assert process.returncode == 130 and said.strip() == "illumgrid: stopped; nothing was written"
+    assert time.monotonic() - begun < 20
+    assert [p.name for p in folder.iterdir()] == ["v.npy"]
+
+
+def test_a_kill_at_any_moment_leaves_a_whole_run_or_none(folder):
+    args = ("run", "v.npy", "--range", "0.3", "0.9", "--grid", "12", "--paths", "4", "--no-preview", "-o")
+    begun = time.monotonic()
+    assert start(*args, "first", cwd=folder).wait() == 0
+    whole = time.monotonic() - begun
+    chance = random.Random(os.getpid())
+    for number in range(4):
+        moments = [whole * chance.uniform(0.3, 1.1) for _ in range(2)]
+        fresh = start(*args, f"out{number}", cwd=folder)
+        again = start(*args, "first", "--overwrite", "--seed", str(number + 1), cwd=folder)
+        begun = time.monotonic()
+        for moment, process in sorted(zip(moments, (fresh, again)), key=lambda pair: pair[0]):
+            time.sleep(max(0.0, begun + moment - time.monotonic()))
+            process.kill()
+            process.communicate()
+        if (folder / f"out{number}").exists():
+            assert ig.load(folder / f"out{number}").recipe["seed"] == 0
+        assert ig.load(folder / "first").recipe["seed"] in range(number + 2)
