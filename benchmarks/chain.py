@@ -1,7 +1,7 @@
 """How long the whole chain takes, as a user meets it: ``python benchmarks/chain.py [VOLUME --range LO HI]``.
 
-Whole processes, wall time and peak memory: ``--help``, the first run of the built-in scene (the kernels compile, into an
-empty cache), the second one, and, when a volume is named, a default run of it.
+Whole processes, wall time and peak memory: ``--help``, the first run of the built-in scene (the kernels compile, into
+an empty cache), the second one, and, when a volume is named, a default run of it.
 """
 
 import argparse

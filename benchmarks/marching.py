@@ -1,14 +1,15 @@
 """How many rays a second the marching kernel follows, on one thread: ``python benchmarks/marching.py [--json FILE]``.
 
-Cosine-distributed rays from points on one level set of a smooth 128³ field (the sum of forty Gaussians), in random order
-and sorted by origin; beside them, where embreex is installed, the same rays against the marching-cubes mesh of that level
-set. Each figure is the best of seven repeats of thread time after a warm-up, in one process.
+Cosine-distributed rays from points on one level set of a smooth 128³ field (the sum of forty Gaussians), in random
+order and sorted by origin; beside them, where embreex is installed, the same rays against the marching-cubes mesh of
+that level set. Each figure is the best of seven repeats of thread time after a warm-up, in one process.
 """
 
 import argparse
 import importlib.util
 import json
 import time
+from functools import partial
 
 import numpy as np
 
@@ -63,9 +64,10 @@ def main():
     t, what, field = np.zeros(RAYS), np.zeros(RAYS, np.int64), np.zeros(RAYS, np.int64)
     normal, level = np.zeros((RAYS, 3)), np.array([ISOVALUE])
     figures = {}
+
     for name, rows in (("random", np.arange(RAYS)), ("sorted", order)):
         p, d = point[rows].copy(), direction[rows].copy()
-        figures[f"marching, {name}"] = rate(lambda: cast_rays(fields, level, p, d, 0, t, field, what, normal))
+        figures[f"marching, {name}"] = rate(partial(cast_rays, fields, level, p, d, 0, t, field, what, normal))
         if importlib.util.find_spec("embreex"):
             from embreex.mesh_construction import TriangleMesh
             from embreex.rtcore_scene import EmbreeScene
@@ -73,7 +75,7 @@ def main():
             embree = EmbreeScene()
             TriangleMesh(embree, mesh.triangles.astype(np.float32))
             start, along = (p + 0.01 * d).astype(np.float32), d.astype(np.float32)
-            figures[f"embreex, {name}"] = rate(lambda: embree.run(start, along))
+            figures[f"embreex, {name}"] = rate(partial(embree.run, start, along))
     print(f"{len(mesh.faces)} triangles, {RAYS} rays, one thread; million rays a second")
     for name, figure in figures.items():
         print(f"  {name:20} {figure:.2f}")

@@ -21,7 +21,7 @@ from illumgrid.volume import (
 )
 from shapes import DIRECTIONS, MIRRORED, ball, refused, sampled
 
-REACH = 3.0  # cells
+REACH = 1.0  # cells: how far a point may be moved along an axis
 UNEVEN = np.array([0.5, 1.25, 3.0])
 
 

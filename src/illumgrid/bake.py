@@ -22,7 +22,8 @@ Progress = Callable[[str, int, int], None]
 class Map(Protocol):
     """Like the built-in ``map``: results in the order of the work. An executor's ``map`` will do."""
 
-    def __call__(self, function: Callable[[Any], Any], work: Iterable[Any], /) -> Iterable[Any]: ...
+    def __call__(self, function: Callable[[Any], Any], work: Iterable[Any], /) -> Iterable[Any]:
+        """Apply `function` to each piece of `work`."""
 
 
 @dataclass(frozen=True, eq=False)

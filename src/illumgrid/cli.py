@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Optional
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -130,42 +130,45 @@ def _default_folder(name: str) -> Path:
 @app.command()
 def run(
     source: Annotated[
-        Optional[str], typer.Argument(metavar="[INPUT]", help="A volume file or DICOM folder, or a built-in scene: nucleus.")
+        str | None,
+        typer.Argument(metavar="[INPUT]", help="A volume file or DICOM folder, or a built-in scene: nucleus."),
     ] = None,
     output: Annotated[
-        Optional[Path], typer.Option("--output", "-o", metavar="DIR", help="Where the result goes. [default: INPUT-light]")
+        Path | None, typer.Option("--output", "-o", metavar="DIR", help="Where the result goes. [default: INPUT-light]")
     ] = None,
     sampler: Annotated[str, typer.Option(help="Where to ask for light: direct, uniform.")] = "direct",
     isovalues: Annotated[
-        Optional[int], typer.Option(min=2, metavar="K", help="Rows of the level table; sampler.count too. [default: 32]")
+        int | None, typer.Option(min=2, metavar="K", help="Rows of the level table; sampler.count too. [default: 32]")
     ] = None,
     limits: Annotated[
-        Optional[tuple[float, float]],
+        tuple[float, float] | None,
         typer.Option("--range", metavar="LO HI", help="Isovalues to sweep. [default: from the data, as info suggests]"),
     ] = None,
     inside: Annotated[
-        Optional[str], typer.Option(help="Which side of the isovalue is solid: above, below. [default: above]")
+        str | None, typer.Option(help="Which side of the isovalue is solid: above, below. [default: above]")
     ] = None,
     backend: Annotated[str, typer.Option(help="Light transport: auto, numba, reference.")] = "auto",
-    paths: Annotated[Optional[int], typer.Option(min=1, metavar="N", help="Light paths from every query. [default: 64]")] = None,
+    paths: Annotated[
+        int | None, typer.Option(min=1, metavar="N", help="Light paths from every query. [default: 64]")
+    ] = None,
     bounces: Annotated[int, typer.Option(min=0, metavar="N", help="Reflections of a path.")] = 4,
     seed: Annotated[int, typer.Option(min=0, metavar="N", help="Equal seeds give equal light.")] = 0,
     interpolator: Annotated[str, typer.Option(help="From samples to nodes: nearest.")] = "nearest",
     grid: Annotated[
-        Optional[int],
+        int | None,
         typer.Option(min=2, metavar="N", help="Nodes along the longest axis. [default: as voxels, at most 128]"),
     ] = None,
     albedo: Annotated[
-        Optional[tuple[float, float, float]],
+        tuple[float, float, float] | None,
         typer.Option(metavar="R G B", help="Share of light that the surface reflects. [default: 0.8 0.8 0.8]"),
     ] = None,
     settings: Annotated[
-        Optional[list[str]], typer.Option("--set", metavar="STAGE.OPTION=VALUE", help="Any option of a stage, repeatable.")
+        list[str] | None, typer.Option("--set", metavar="STAGE.OPTION=VALUE", help="Any option of a stage, repeatable.")
     ] = None,
     smooth: Annotated[
-        Optional[float], typer.Option(min=0.0, metavar="SIGMA", help="Gaussian blur in voxels before anything else.")
+        float | None, typer.Option(min=0.0, metavar="SIGMA", help="Gaussian blur in voxels before anything else.")
     ] = None,
-    threads: Annotated[Optional[int], typer.Option(min=1, metavar="N", help="Threads. [default: one a processor]")] = None,
+    threads: Annotated[int | None, typer.Option(min=1, metavar="N", help="Threads. [default: one a processor]")] = None,
     no_preview: Annotated[bool, typer.Option("--no-preview", help="Leave the picture out.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a finished run in DIR.")] = False,
 ) -> None:
@@ -192,7 +195,9 @@ def run(
             name = source or "nucleus"
             preset = SCENES[name]
             if extra := _given(range=limits, inside=inside, albedo=albedo, smooth=smooth):
-                raise BadInput(f"{extra} came with the built-in scene {name!r}; expected a volume file with them: leave them out")
+                raise BadInput(
+                    f"{extra} came with the built-in scene {name!r}; expected a volume file with them: leave them out"
+                )
             folder = output or _default_folder(name)
             store.claim(folder, overwrite)
             scene, grid, paths = preset.make(), grid or preset.grid, paths or preset.paths
@@ -232,12 +237,14 @@ def preview(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="A finished run.")],
     output: Annotated[Path, typer.Option("--output", "-o", metavar="PNG", help="The picture to write.")],
     field: Annotated[
-        Optional[str], typer.Option(metavar="NAME", help="Field that --isovalue belongs to. [default: the first]")
+        str | None, typer.Option(metavar="NAME", help="Field that --isovalue belongs to. [default: the first]")
     ] = None,
     isovalue: Annotated[
-        Optional[float], typer.Option(metavar="C", help="Isovalue to show. [default: the middle of the range]")
+        float | None, typer.Option(metavar="C", help="Isovalue to show. [default: the middle of the range]")
     ] = None,
-    local: Annotated[bool, typer.Option("--local", help="A lamp at the camera in place of the computed light.")] = False,
+    local: Annotated[
+        bool, typer.Option("--local", help="A lamp at the camera in place of the computed light.")
+    ] = False,
 ) -> None:
     """Draw one isosurface of a finished run."""
     from illumgrid import preview as pictures
@@ -251,7 +258,9 @@ def preview(
     if isovalue is not None:
         low, high = light.scene.fields[number].range
         if not low <= isovalue <= high:
-            say(f"note: the isovalue {isovalue:g} lies outside the range {low:g} to {high:g} that the light was computed for")
+            say(
+                f"note: the isovalue {isovalue:g} lies outside the range {low:g} to {high:g} of the light"
+            )
     store.write_file(output, pictures.png(pictures.render(light, field, isovalue, local=local)))
     say(f"wrote {output}" + ("" if local else f" at exposure {light.exposure:.4g}"))
 
@@ -270,7 +279,9 @@ def histogram_line(volume: "Volume", width: int = 64) -> str:
 
 @app.command()
 def info(
-    source: Annotated[str, typer.Argument(metavar="DIR|VOLUME", help="A finished run, a volume file or a DICOM folder.")],
+    source: Annotated[
+        str, typer.Argument(metavar="DIR|VOLUME", help="A finished run, a volume file or a DICOM folder.")
+    ],
 ) -> None:
     """Tell what is inside a volume or a finished run."""
     from illumgrid import store
@@ -315,10 +326,16 @@ def _told_run(source: str) -> None:
         _told_lattice(field.name, field.volume)
         typer.echo(f"  range            {field.range[0]:.6g} to {field.range[1]:.6g}, inside {field.inside}")
         supported = float((grid.support > 0).mean())
-        typer.echo(f"  light            {' x '.join(map(str, grid.spec.shape))} nodes, {supported:.1%} with light of their own")
+        typer.echo(
+            f"  light            {' x '.join(map(str, grid.spec.shape))} nodes, {supported:.1%} with light of their own"
+        )
     recipe = light.recipe
-    names = ", ".join(f"{kind} {recipe[kind]['name']}" for kind in ("sampler", "backend", "interpolator") if kind in recipe)
-    typer.echo(f"recipe: {names}, {recipe.get('paths')} paths, {recipe.get('bounces')} bounces, seed {recipe.get('seed')}")
+    names = ", ".join(
+        f"{kind} {recipe[kind]['name']}" for kind in ("sampler", "backend", "interpolator") if kind in recipe
+    )
+    typer.echo(
+        f"recipe: {names}, {recipe.get('paths')} paths, {recipe.get('bounces')} bounces, seed {recipe.get('seed')}"
+    )
     for sentence in recipe.get("warnings", []):
         typer.echo(f"note: {sentence}")
 
@@ -343,7 +360,9 @@ def guarded(command: Callable[[], Any]) -> int:
     except OSError as error:
         say(f"illumgrid: {error.strerror or error}{f': {error.filename}' if error.filename else ''}")
     except Exception as error:
-        if not hasattr(error, "show"):  # a usage error: of click's, or of typer's own copy of click, as its release has it
+        if not hasattr(
+            error, "show"
+        ):  # a usage error: of click's, or of typer's own copy of click, as its release has it
             raise
         error.show()
     return 2

@@ -20,7 +20,7 @@ def spread(points: Floats, voxels: int = _VOXELS, sigma: float = _SPREAD) -> Vol
     along = [np.exp(-((axis[:, None] - points[:, a]) ** 2) / (2 * sigma**2)) for a in range(3)]
     density = np.einsum("in,jn,kn->ijk", *along)
     step = 2.0 / (voxels - 1)
-    return Volume(density / density.max(), origin=(-1, -1, -1), spacing=(step, step, step))
+    return Volume(density / density.max(), origin=np.full(3, -1.0), spacing=np.full(3, step))
 
 
 def nucleons(count: int, turn: float) -> Floats:
@@ -28,17 +28,20 @@ def nucleons(count: int, turn: float) -> Floats:
     k = np.arange(count - 1) + 0.5
     height, angle = 1 - 2 * k / (count - 1), np.pi * (1 + 5**0.5) * k + turn
     ring = np.sqrt(1 - height**2)
-    return np.vstack([_RADIUS * np.stack([ring * np.cos(angle), ring * np.sin(angle), height], axis=1), np.zeros((1, 3))])
+    return np.vstack(
+        [_RADIUS * np.stack([ring * np.cos(angle), ring * np.sin(angle), height], axis=1), np.zeros((1, 3))]
+    )
 
 
 def nucleus() -> Scene:
     """Densities of eight protons and eight neutrons under a white sky (after Figure 7 of Banks & Beason 2007)."""
-    protons = Material((0.85, 0.42, 0.28))
-    neutrons = Material((0.35, 0.55, 0.82))
+    protons = Material(np.array([0.85, 0.42, 0.28]))
+    neutrons = Material(np.array([0.35, 0.55, 0.82]))
+    limits = np.array([0.15, 0.75])
     return Scene(
         (
-            Field("protons", spread(nucleons(8, 0.0)), protons, (0.15, 0.75)),
-            Field("neutrons", spread(nucleons(9, 1.2)[:8]), neutrons, (0.15, 0.75)),
+            Field("protons", spread(nucleons(8, 0.0)), protons, limits),
+            Field("neutrons", spread(nucleons(9, 1.2)[:8]), neutrons, limits),
         ),
         np.ones(3),
     )

@@ -41,7 +41,7 @@ class GridSpec:
     def over(cls, lattice: Lattice, longest: int) -> "GridSpec":
         """Nodes from the first to the last voxel centre, `longest` along the axis with most voxels.
 
-        Axis i gets max(2, 1 + round((n_i - 1)(longest - 1)/(n_max - 1))) nodes: with `longest` = n_max they are the voxels.
+        Axis i gets max(2, 1 + round((n_i - 1)(longest - 1)/(n_max - 1))) nodes: `longest` = n_max gives the voxels.
         """
         if longest < 2:
             raise BadInput(f"a grid of {longest} nodes was asked for; expected at least 2 along the longest axis")

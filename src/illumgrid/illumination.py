@@ -166,19 +166,16 @@ def run(
         raise BadInput(f"the seed is {seed}; expected a whole number from 0 to 2**64 - 1")
     levels = level_table(scene, 32 if isovalues is None else isovalues)
     options = {}
-    if isovalues is not None and isinstance(sampler, str):
-        if "count" in registry.option_names("sampler", sampler):
-            options["count"] = isovalues
+    if isovalues is not None and isinstance(sampler, str) and "count" in registry.option_names("sampler", sampler):
+        options["count"] = isovalues
     chosen = _stage("sampler", sampler, options), _stage("backend", backend), _stage("interpolator", interpolator)
-    specs = [
-        GridSpec.over(f.volume, min(max(f.volume.shape), LONGEST) if grid is None else grid) for f in scene.fields
-    ]
+    specs = [GridSpec.over(f.volume, min(max(f.volume.shape), LONGEST) if grid is None else grid) for f in scene.fields]
     baked = bake(scene, specs, *chosen, paths=range(paths), bounces=bounces, seed=seed, map=map, progress=progress)
     for field, holes in zip(scene.fields, baked.holes):
         if holes:
             warnings.warn(
-                f"{holes} nodes within the range of field {field.name!r} got no light of their own (no normal, no sample "
-                "in reach, or inside another solid); they show that of the nearest node",
+                f"{holes} nodes within the range of field {field.name!r} got no light of their own (no normal, no "
+                "sample in reach, or inside another solid); they show that of the nearest node",
                 IllumgridWarning,
                 stacklevel=2,
             )

@@ -71,7 +71,7 @@ class Queries:
         own = scene.fields[field]
         index = world_to_index(own.volume, world)
         top = np.array(own.volume.shape) - 1
-        good = (np.isfinite(index) & (index >= 0) & (index <= top)).all(axis=1)
+        good = np.asarray((np.isfinite(index) & (index >= 0) & (index <= top)).all(axis=1))
         index = np.where(good[:, None], index, 0.0)
         if level is None:
             isovalues = interpolate(own.volume, index)
@@ -126,7 +126,7 @@ class Samples:
     @property
     def error(self) -> NDArray[np.float32]:
         """Root mean square (n,) over RGB of the standard error."""
-        return np.sqrt((self.stderr.astype(float) ** 2).mean(axis=1)).astype(np.float32)
+        return np.asarray(np.sqrt((self.stderr.astype(float) ** 2).mean(axis=1)), dtype=np.float32)
 
 
 def check_request(paths: range, bounces: int) -> None:
@@ -163,7 +163,9 @@ def combine(one: Samples, other: Samples) -> Samples:
 
 def join_queries(parts: Sequence[Queries]) -> Queries:
     """One after the other."""
-    return Queries(*(np.concatenate([getattr(p, n) for p in parts]) for n in ("id", "point", "normal", "level", "target")))
+    return Queries(
+        *(np.concatenate([getattr(p, n) for p in parts]) for n in ("id", "point", "normal", "level", "target"))
+    )
 
 
 def join_samples(parts: Sequence[Samples]) -> Samples:

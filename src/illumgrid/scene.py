@@ -13,7 +13,9 @@ def _rgb(value: ArrayLike, name: str, at_most: float) -> Floats:
     color = np.array(value, dtype=float)
     if color.shape != (3,) or not np.isfinite(color).all() or (color < 0).any() or (color > at_most).any():
         upper = "up" if at_most == np.inf else f"to {at_most:g}"
-        raise BadInput(f"{name} is {np.asarray(value).tolist()}; expected three numbers (red, green, blue) from 0 {upper}")
+        raise BadInput(
+            f"{name} is {np.asarray(value).tolist()}; expected three numbers (red, green, blue) from 0 {upper}"
+        )
     color.setflags(write=False)
     return color
 
@@ -74,7 +76,9 @@ def suggest_range(volume: Volume, inside: Side = "above") -> tuple[float, float,
     threshold = float(threshold_otsu(hist=(counts, depth)))
     within = np.where(depth > threshold, counts, 0)
     # The bin at which half of the object is passed; at least one bin deeper than the threshold.
-    deep = float(depth[max(np.searchsorted(np.cumsum(within), 0.5 * within.sum()), np.searchsorted(depth, threshold) + 1)])
+    deep = float(
+        depth[max(np.searchsorted(np.cumsum(within), 0.5 * within.sum()), np.searchsorted(depth, threshold) + 1)]
+    )
     share = within.sum() / counts.sum()
     low, high = sorted((sign * threshold, sign * deep))
     why = (
@@ -115,7 +119,9 @@ class Field:
         asked = suggest_range(volume, self.inside)[:2] if self.range is None else self.range
         limits = np.array(asked, dtype=float)
         if limits.shape != (2,) or not np.isfinite(limits).all() or not limits[0] < limits[1]:
-            raise BadInput(f"the range of field {self.name!r} is {np.asarray(asked).tolist()}; expected a lower and a higher isovalue")
+            raise BadInput(
+                f"the range of field {self.name!r} is {np.asarray(asked).tolist()}; expected a low and a high isovalue"
+            )
         low, high = float(volume.values.min()), float(volume.values.max())
         if limits[1] < low or limits[0] > high:
             raise BadInput(
@@ -186,16 +192,16 @@ class Scene:
         name: str = "field",
     ) -> "Scene":
         """One field under a white sky of radiance 1."""
-        return cls((Field(name, volume, Material(albedo), range, inside),), np.ones(3))  # type: ignore[arg-type]
+        return cls((Field(name, volume, Material(np.asarray(albedo)), range, inside),), np.ones(3))  # type: ignore[arg-type]
 
     def levels(self, t: ArrayLike) -> Floats:
-        """Settings of all sliders: (n, F) isovalues for t (n,) from 0, each field's lowest, to 1, its highest (clamped)."""
+        """Settings (n, F) of all sliders for t (n,) from 0, each field's lowest isovalue, to 1, its highest (clamped)."""
         low, high = np.array([f.range for f in self.fields]).T
         share = np.clip(np.atleast_1d(np.asarray(t, float)), 0.0, 1.0)[:, None]
         return (1 - share) * low + share * high
 
     def levels_through(self, field: int, isovalues: ArrayLike) -> Floats:
-        """Settings (n, F) with field number `field` at `isovalues` (n,), all other sliders where the common sweep has them."""
+        """Settings (n, F) with field number `field` at `isovalues` (n,), the other sliders as the common sweep has them."""
         own = np.atleast_1d(np.asarray(isovalues, float))
         low, high = self.fields[field].range
         rows = self.levels((own - low) / (high - low))
@@ -205,7 +211,8 @@ class Scene:
     def to_frame(self, points: ArrayLike) -> Floats:
         """Frame coordinates (n, 3) of world points (n, 3)."""
         first = self.fields[0].volume
-        return (np.asarray(points, float) - first.origin) @ first.direction
+        local: Floats = (np.asarray(points, float) - first.origin) @ first.direction
+        return local
 
     def from_frame(self, points: ArrayLike) -> Floats:
         """World points (n, 3) of frame coordinates (n, 3)."""

@@ -22,4 +22,4 @@ def encode_srgb(linear: NDArray[np.floating]) -> NDArray[np.uint8]:
     """Eight-bit sRGB of linear display values, clamped to 0 .. 1 (IEC 61966-2-1)."""
     c = np.clip(linear, 0.0, 1.0)
     curve = np.where(c <= 0.0031308, 12.92 * c, 1.055 * np.power(np.maximum(c, 1e-9), 1 / 2.4) - 0.055)
-    return np.round(255.0 * curve).astype(np.uint8)
+    return np.asarray(np.round(255.0 * curve), dtype=np.uint8)

@@ -26,12 +26,15 @@ class Lattice(Protocol):
     @property
     def shape(self) -> tuple[int, int, int]:
         """Number of points along x, y, z."""
+
     @property
     def origin(self) -> Floats:
         """World position of index (0, 0, 0)."""
+
     @property
     def spacing(self) -> Floats:
         """World distance between neighbours along each axis."""
+
     @property
     def direction(self) -> Floats:
         """Columns are the world directions of the axes."""
@@ -107,9 +110,9 @@ class Volume:
         if not np.isfinite(single).any():
             raise BadInput("the values are all NaN or infinite; expected finite numbers")
         single.setflags(write=False)
+        object.__setattr__(self, "values", single)
         for name, value in zip(
-            ("values", "origin", "spacing", "direction"),
-            (single, *placement(self.origin, self.spacing, self.direction)),
+            ("origin", "spacing", "direction"), placement(self.origin, self.spacing, self.direction)
         ):
             value.setflags(write=False)
             object.__setattr__(self, name, value)
@@ -141,8 +144,8 @@ def finite(volume: Volume, inside: Side) -> Volume:
     bad = int(good.size - good.sum())
     where = np.unravel_index(int(np.argmin(good)), volume.shape)
     warnings.warn(
-        f"{bad} of {good.size} voxels are not finite (the first at {tuple(map(int, where))}): NaN became {outermost:g}, "
-        f"the value farthest outside, infinities became {low:g} and {high:g}",
+        f"{bad} of {good.size} voxels are not finite (the first at {tuple(map(int, where))}): NaN became "
+        f"{outermost:g}, the value farthest outside, infinities became {low:g} and {high:g}",
         IllumgridWarning,
         stacklevel=2,
     )
@@ -187,7 +190,7 @@ def cell_gradient(volume: Volume, index: Floats) -> Floats:
 
 
 def smooth_gradient(volume: Volume, index: Floats) -> Floats:
-    """Trilinear interpolation (n, 3) of central differences (one-sided at the border), per world unit, along the axes."""
+    """Central differences (one-sided at the border), interpolated: (n, 3), per world unit, along the volume's axes."""
     cell, f = cells(volume, index)
     top = np.array(volume.shape) - 1
     result = np.zeros((len(index), 3))
@@ -226,7 +229,7 @@ _MET = 1e-10
 
 
 def project(volume: Volume, index: Floats, isovalues: Floats) -> tuple[Floats, NDArray[np.bool_]]:
-    """Move fractional indices (n, 3) onto the trilinear level sets of `isovalues` (n,), by Newton steps along the gradient.
+    """Move fractional indices (n, 3) onto the level sets of `isovalues` (n,), by Newton steps along the gradient.
 
     Returns
     -------
@@ -237,7 +240,7 @@ def project(volume: Volume, index: Floats, isovalues: Floats) -> tuple[Floats, N
     """
     at = index.copy()
     top = np.array(volume.shape) - 1.0
-    arrived = ((index >= -ON_A_VOXEL) & (index <= top + ON_A_VOXEL)).all(axis=1)
+    arrived = np.asarray(((index >= -ON_A_VOXEL) & (index <= top + ON_A_VOXEL)).all(axis=1))
     last = np.full(len(at), np.inf)
     moving = np.flatnonzero(arrived)
     for _ in range(24):
@@ -249,7 +252,9 @@ def project(volume: Volume, index: Floats, isovalues: Floats) -> tuple[Floats, N
             slope[flat] = smooth_gradient(volume, here[flat])
         slope *= volume.spacing  # per index step
         largest = np.abs(slope).max(axis=1, initial=0.0)
-        step = slope / np.where(largest > 0, largest, 1.0)[:, None]  # scaled: the square of a tiny slope would underflow
+        step = (
+            slope / np.where(largest > 0, largest, 1.0)[:, None]
+        )  # scaled: the square of a tiny slope would underflow
         step *= np.divide(miss / np.where(largest > 0, largest, 1.0), (step * step).sum(axis=1), where=largest > 0,
                           out=np.zeros_like(miss))[:, None]  # fmt: skip
         length = np.abs(step).max(axis=1, initial=0.0)

@@ -26,7 +26,7 @@ ON_A_VOXEL = 1e-7  # as in illumgrid.volume
 
 @jit
 def first_cell(u, d, last):
-    """Cell along one axis that a ray enters at index coordinate u; outside 0 .. last - 1 it leaves the field at once."""
+    """Cell along one axis that a ray enters at index coordinate u; outside 0 .. last - 1 it has left the field."""
     cell = int(np.floor(u))
     if u == cell and (d < 0.0 or (d == 0.0 and cell == last)):
         cell -= 1
@@ -288,7 +288,8 @@ def gradient_normal(scene, f, ux, uy, uz):
     Where they cancel, that of the trilinear cell.
     """
     last_x, last_y, last_z = scene.shape[f, 0] - 1, scene.shape[f, 1] - 1, scene.shape[f, 2] - 1
-    cx, cy, cz = follow(ux, 0.0, 0.0, 0, last_x - 1), follow(uy, 0.0, 0.0, 0, last_y - 1), follow(uz, 0.0, 0.0, 0, last_z - 1)
+    cx, cy = follow(ux, 0.0, 0.0, 0, last_x - 1), follow(uy, 0.0, 0.0, 0, last_y - 1)
+    cz = follow(uz, 0.0, 0.0, 0, last_z - 1)
     wx, wy, wz = min(max(ux - cx, 0.0), 1.0), min(max(uy - cy, 0.0), 1.0), min(max(uz - cz, 0.0), 1.0)
     step_y = scene.shape[f, 2]
     step_x = step_y * scene.shape[f, 1]
@@ -374,7 +375,10 @@ def buried(scene, level, x, y, z, own):
 
 @jit
 def walk(scene, key, path, bounces, level, own, x, y, z, nx, ny, nz):
-    """Worth (red, green, blue) of one path from a point on the level set of field `own`: its irradiance is π times the mean."""
+    """Worth (red, green, blue) of one path from a point on the level set of field `own`.
+
+    The irradiance there is π times the mean over the paths.
+    """
     red, green, blue = 0.0, 0.0, 0.0
     keep_red, keep_green, keep_blue = 1.0, 1.0, 1.0  # throughput: share of the light that comes back along the path
     on, on_cap = own, False
@@ -418,7 +422,7 @@ def walk(scene, key, path, bounces, level, own, x, y, z, nx, ny, nz):
 
 @jit
 def solve_queries(scene, ids, point, normal, level, target, first, count, bounces, seed, mean, m2, paths):
-    """Irradiance at each query (frame coordinates), from paths number first .. first + count - 1; mean, m2, paths are filled."""
+    """Irradiance at queries in frame coordinates, from `count` paths from number `first` on; fills mean, m2, paths."""
     for i in range(ids.shape[0]):
         x, y, z = point[i, 0], point[i, 1], point[i, 2]
         nx, ny, nz = normal[i, 0], normal[i, 1], normal[i, 2]

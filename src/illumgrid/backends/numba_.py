@@ -34,7 +34,7 @@ class Numba:
 
     def __post_init__(self) -> None:
         if self.threads < 0:
-            raise BadInput(f"{self.threads} threads were asked for; expected a positive number, or 0 for all processors")
+            raise BadInput(f"{self.threads} threads were asked for; expected a positive number, or 0 for all")
 
     def solve(self, scene: Scene, queries: Queries, *, paths: range, bounces: int, seed: int) -> Samples:
         """Trace paths from every query: see `illumgrid.stages.Backend`."""
@@ -51,7 +51,7 @@ class Numba:
         point, normal, level = in_frame(scene, queries)
 
         def chunk(rows: slice) -> None:
-            with np.errstate(over="ignore"):  # the random numbers wrap around, on purpose; NumPy sees it without the JIT
+            with np.errstate(over="ignore"):  # random numbers wrap around, on purpose; without the JIT NumPy sees it
                 solve_queries(
                     fields, queries.id[rows], point[rows], normal[rows], level[rows], queries.target[rows],
                     paths.start, len(paths), bounces, np.uint64(seed), mean[rows], m2[rows], count[rows],

@@ -4,6 +4,7 @@ The path loop has the headings of `kernels.walk`; everything that Numba's kernel
 """
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import ClassVar, Literal
 
 import numpy as np
@@ -25,7 +26,7 @@ _CORNERS = np.array(list(np.ndindex(2, 2, 2)))
 def voxels(scene: Marchable, f: int) -> NDArray[np.float32]:
     """The values of field f, turned so that its solid is {v >= level}, axes x, y, z."""
     nx, ny, nz = scene.shape[f]
-    return scene.values[scene.start[f] : scene.start[f] + nx * ny * nz].reshape(nx, ny, nz)
+    return np.asarray(scene.values[scene.start[f] : scene.start[f] + nx * ny * nz].reshape(nx, ny, nz))
 
 
 def index_of(scene: Marchable, f: int, x: Floats) -> Floats:
@@ -36,9 +37,9 @@ def index_of(scene: Marchable, f: int, x: Floats) -> Floats:
 
 
 def cubic(v: NDArray[np.float32], level: Floats, cell: Ints, e: Floats, d: Floats) -> Floats:
-    """Coefficients (n, 4) of v - level along e + t d in local cell coordinates: three blends, each one degree higher."""
+    """Coefficients (n, 4) of v - level along e + t d, local in the cell: three blends, each one degree higher."""
     corners = v[tuple((cell[:, None, :] + _CORNERS).transpose(2, 0, 1))].astype(float) - level[:, None]
-    q = corners.reshape(-1, 2, 2, 2, 1)
+    q: Floats = corners.reshape(-1, 2, 2, 2, 1)
     for axis in range(3):
         low, rise = q[:, 0], q[:, 1] - q[:, 0]
         shape = (-1,) + (1,) * (rise.ndim - 1)
@@ -59,7 +60,7 @@ def evaluate(q: Floats, t: Floats) -> Floats:
 def first_rise(q: Floats, end: Floats) -> Floats:
     """Smallest t (n,) in [0, end] at which the cubics q (n, 4), below 0 at 0, reach 0; inf if none.
 
-    The roots of the derivative part the interval into monotone pieces; the first piece that ends at or above 0 is halved.
+    The roots of the derivative part the interval into monotone pieces; the first that ends at or above 0 is halved.
     """
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         a, b, c = q[:, 1], q[:, 2], q[:, 3]
@@ -68,7 +69,7 @@ def first_rise(q: Floats, end: Floats) -> Floats:
     knots = np.stack([np.zeros(len(q)), *np.where((stationary > 0) & (stationary < end), stationary, 0.0), end])
     knots = np.maximum.accumulate(knots, axis=0)
     left, right, found = np.zeros(len(q)), np.zeros(len(q)), np.zeros(len(q), bool)
-    for low, high in zip(knots[:-1], knots[1:]):
+    for low, high in pairwise(knots):
         here = ~found & (evaluate(q, high) >= 0)
         left, right = np.where(here, low, left), np.where(here, high, right)
         found |= here
@@ -92,7 +93,7 @@ def rise_from_surface(q: Floats, end: Floats) -> Floats:
 
 
 def march(v: NDArray[np.float32], level: Floats, u: Floats, d: Floats, on_surface: Bools) -> tuple[Floats, Ints, Ints]:
-    """First meeting of rays u + t d, in index coordinates, with the solid {v >= level}: (t, what, axis of a cap), each (n,)."""
+    """First meeting of rays u + t d, in index coordinates, with {v >= level}: (t, what, axis of a cap), each (n,)."""
     n, last = len(u), np.array(v.shape) - 1
     t_hit, what, face = np.full(n, np.inf), np.full(n, MISS), np.full(n, -1)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -193,11 +194,18 @@ def cosine_direction(u1: Floats, u2: Floats, normal: Floats) -> Floats:
     tangent = np.stack([1 + sign * nx * nx * a, sign * b, -sign * nx], axis=1)
     bitangent = np.stack([b, sign + ny * ny * a, -ny], axis=1)
     local = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.sqrt(1 - u1)])[:, :, None]
-    return local[0] * tangent + local[1] * bitangent + local[2] * normal
+    return np.asarray(local[0] * tangent + local[1] * bitangent + local[2] * normal)
 
 
 def walk(
-    scene: Marchable, key: NDArray[np.uint64], path: int, bounces: int, level: Floats, own: Ints, x: Floats, normal: Floats
+    scene: Marchable,
+    key: NDArray[np.uint64],
+    path: int,
+    bounces: int,
+    level: Floats,
+    own: Ints,
+    x: Floats,
+    normal: Floats,
 ) -> Floats:
     """Worth (n, 3) of one path from each point on a level set: the irradiance is π times the mean."""
     worth, keep = np.zeros((len(x), 3)), np.ones((len(x), 3))  # keep: share of the light that comes back along the path
@@ -239,7 +247,7 @@ def walk(
 
 def holes(scene: Marchable, level: Floats, x: Floats, normal: Floats, target: Ints) -> Bools:
     """Queries (n,) without a normal, or inside the solid of a field that is not their own."""
-    bad = ~normal.any(axis=1)
+    bad: Bools = np.asarray(~normal.any(axis=1))
     for f in range(len(scene.start)):
         u, last = index_of(scene, f, x), scene.shape[f] - 1
         cell = np.clip(np.floor(u), 0, last - 1).astype(np.int64)
@@ -265,9 +273,8 @@ class Reference:
         with np.errstate(over="ignore"):  # the random numbers wrap around, on purpose
             key = stream(np.uint64(seed), queries.id[good])
             for n, path in enumerate(paths):
-                worth = walk(
-                    fields, key, path, bounces, level[good], queries.target[good].astype(np.int64), point[good], normal[good]
-                )
+                own = queries.target[good].astype(np.int64)
+                worth = walk(fields, key, path, bounces, level[good], own, point[good], normal[good])
                 off = np.pi * worth - mean[good]
                 mean[good] += off / (n + 1)
                 m2[good] += off * (np.pi * worth - mean[good])

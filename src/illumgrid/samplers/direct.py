@@ -68,5 +68,9 @@ class Direct:
                 # there (at the value of an empty background everything is solid, and dark).
                 asked = Queries.at(scene, points, field=number, level=np.clip(own, *field.range))
                 yield Queries(
-                    batch.astype(np.uint64) | np.uint64(number << 40), asked.point, asked.normal, asked.level, asked.target
+                    batch.astype(np.uint64) | np.uint64(number << 40),
+                    asked.point,
+                    asked.normal,
+                    asked.level,
+                    asked.target,
                 )

@@ -31,7 +31,9 @@ class Uniform:
         if self.count < 2:
             raise BadInput(f"uniform.count is {self.count}; expected at least 2 isovalues")
         if self.points < 0:
-            raise BadInput(f"uniform.points is {self.points}; expected a positive number, or 0 for one a node spacing squared")
+            raise BadInput(
+                f"uniform.points is {self.points}; expected a positive number, or 0 for one a node spacing squared"
+            )
 
     def queries(self, scene: Scene, specs: Sequence[GridSpec], seed: int) -> Iterator[Queries]:
         """Ask on `count` rows of the common sweep: see `illumgrid.stages.Sampler`."""
