@@ -1,4 +1,4 @@
-"""The command line as a process: what it imports, and what is left when it is stopped or killed."""
+"""The command line as a process: what it imports, what trouble becomes, what is left when it is stopped or killed."""
 
 import os
 import random
@@ -9,8 +9,11 @@ import time
 
 import numpy as np
 import pytest
+import typer
 
 import illumgrid as ig
+from illumgrid import cli
+from illumgrid.errors import BadInput
 from shapes import ball
 
 COMMAND = (sys.executable, "-m", "illumgrid")
@@ -80,3 +83,28 @@ def test_a_kill_at_any_moment_leaves_a_whole_run_or_none(folder):
         if (folder / f"out{number}").exists():
             assert ig.load(folder / f"out{number}").recipe["seed"] == 0
         assert ig.load(folder / "first").recipe["seed"] in range(number + 2)
+
+
+@pytest.mark.parametrize(
+    "trouble, code, word",
+    [
+        (KeyboardInterrupt(), 130, "stopped"),
+        (typer.Abort(), 130, "stopped"),
+        (BadInput("what came"), 2, "what came"),
+        (MemoryError(), 2, "memory"),
+        (OSError(28, "No space left on device", "here"), 2, "No space left on device: here"),
+    ],
+)
+def test_trouble_is_an_exit_code_and_a_sentence(capsys, trouble, code, word):
+    def fail():
+        raise trouble
+
+    assert cli.guarded(fail) == code
+    said = capsys.readouterr().err
+    assert said.startswith("illumgrid: ") and word in said and said.count("\n") == 1
+
+
+def test_a_mistake_of_ours_is_not_dressed_up_as_bad_input():
+    with pytest.raises(ZeroDivisionError):
+        cli.guarded(lambda: 1 / 0)
+    assert cli.guarded(lambda: None) == 0 and cli.guarded(lambda: 3) == 3

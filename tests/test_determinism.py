@@ -5,9 +5,10 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
-from illumgrid.backends.numba_ import Numba
+from illumgrid.backends.numba_ import Numba, cores
 from illumgrid.backends.reference import Reference
 from illumgrid.bake import bake
+from illumgrid.errors import BadInput
 from illumgrid.grid import GridSpec
 from illumgrid.interpolators.nearest import Nearest
 from illumgrid.samplers import direct
@@ -126,3 +127,14 @@ def test_samplers_repeat_themselves():
             np.testing.assert_array_equal(getattr(one, name), getattr(again, name))
     strewn = [join_queries(list(on_level_sets(scene, [0.5], seed))).point for seed in (0, 1)]
     assert not np.array_equal(*strewn)
+
+
+def test_what_cannot_be_answered_is_refused():
+    scene = furnace(noise(4, (4, 3, 3)))
+    with pytest.raises(BadInput, match="threads"):
+        Numba(threads=-1)
+    for backend in (Numba(), Reference()):
+        for paths, bounces in ((range(0, 4, 2), 1), (range(-1, 3), 1), (4, 1), (range(2), -1)):
+            with pytest.raises(BadInput, match="expected"):
+                backend.solve(scene, everywhere(scene), paths=paths, bounces=bounces, seed=0)
+    assert cores() >= 1

@@ -1,14 +1,16 @@
 """The chain as a library user sees it: run, look up, colour, save, load."""
 
 import json
+from dataclasses import dataclass
 from importlib.metadata import version
+from typing import ClassVar
 
 import numpy as np
 import pytest
 from PIL import Image
 
 import illumgrid as ig
-from illumgrid import preview
+from illumgrid import preview, registry
 from illumgrid.tone import encode_srgb
 from shapes import ball, lit, refused, sky
 
@@ -144,9 +146,31 @@ def test_only_isovalues_that_were_given_set_the_count_of_a_named_sampler(isovalu
 
 
 def test_stage_objects_serve_as_well_as_names(light):
-    stages = {"sampler": ig.sampler("direct"), "backend": ig.backend("numba"), "interpolator": ig.interpolator("nearest")}
+    names = {"sampler": "direct", "backend": "numba", "interpolator": "nearest"}
+    stages = {kind: getattr(ig, kind)(name) for kind, name in names.items()}
     again = ig.run(light.scene, **stages, **QUICK)
     assert np.array_equal(again.grids[0].values, light.grids[0].values)
+
+
+def test_options_that_are_true_or_false_are_read_as_such():
+    assert registry._parse("x.y", "True", bool) is True and registry._parse("x.y", "false", bool) is False
+    refused(lambda: registry._parse("x.y", "maybe", bool), "x.y", "'maybe'", "true or false")
+    assert registry._parse("x.y", "1e-3", float) == 1e-3
+    refused(lambda: registry._parse("x.y", "much", float), "'much'", "a number")
+
+
+def test_a_sampler_without_a_question_makes_a_grid_of_holes():
+    @dataclass(frozen=True)
+    class Silent:
+        name: ClassVar[str] = "silent"
+
+        def queries(self, scene, specs, seed):
+            return []
+
+    with pytest.warns(ig.IllumgridWarning, match="nodes within the range"):
+        light = ig.run(sky(ball(8)), sampler=Silent(), **QUICK)
+    assert not light.grids[0].support.any() and not light.grids[0].values.any()
+    assert light.recipe["queries"] == 0 and light.recipe["relative_error"] == [None] and light.exposure == 1
 
 
 def test_holes_within_the_range_are_a_warning_that_counts_them():

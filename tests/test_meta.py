@@ -28,7 +28,8 @@ for name in {names}:
 def test_every_module_imports_alone_and_without_a_warning(part):
     names = MODULES[part::2]
     assert len(names) > 8
-    done = subprocess.run([sys.executable, "-W", "error", "-c", ALONE.format(names=names)], capture_output=True, text=True)
+    command = [sys.executable, "-W", "error", "-c", ALONE.format(names=names)]
+    done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0 and not done.stderr, done.stderr
 
 

@@ -1,4 +1,4 @@
-"""Pictures: tones of the standard, never mirrored, the same however the array is stored, and the whole object in view."""
+"""Pictures: tones of the standard, never mirrored however the array is stored, and the whole object in view."""
 
 import io
 
@@ -21,7 +21,7 @@ SIZE = {"width": 120, "height": 90}
 
 @pytest.mark.parametrize(
     "linear, byte",
-    [(0.0, 0), (1.0, 255), (0.5, 188), (0.25, 137), (0.214041, 127.5), (0.0031308, 10), (0.001, 3), (0.18, 118), (0.8, 231)],
+    [(0, 0), (1, 255), (0.5, 188), (0.25, 137), (0.21404, 127.5), (0.0031308, 10), (0.001, 3), (0.18, 118), (0.8, 231)],
 )
 def test_srgb_is_that_of_the_standard(linear, byte):
     assert abs(float(encode_srgb(np.array([linear]))[0]) - byte) <= 0.5
@@ -57,16 +57,18 @@ BALLS = {"x": ((0.65, 0, 0), 0.25), "front": ((0, -0.6, 0), 0.2), "top": ((0, 0,
 
 
 def three_balls(axes=(0, 1, 2), flips=(1, 1, 1)):
-    """A red ball at +x, a green one at the front (-y), a blue one on top (+z), stored along permuted or flipped axes."""
+    """A red ball at +x, a green one in front (-y), a blue one on top (+z), stored along these axes."""
     direction = np.eye(3)[:, list(axes)] * flips
     shape = np.array([40, 36, 44])[list(axes)]
     spacing = 2 / (shape - 1)
     origin = -direction @ np.ones(3)
     fields = []
     for (name, (centre, radius)), color in zip(BALLS.items(), np.eye(3)):
-        volume = sampled(
-            lambda x, c=centre, r=radius: 1 + r - np.linalg.norm(x - np.array(c), axis=1), tuple(shape), origin, spacing, direction
-        )
+
+        def inside(x, centre=centre, radius=radius):
+            return 1 + radius - np.linalg.norm(x - np.array(centre), axis=1)
+
+        volume = sampled(inside, tuple(shape), origin, spacing, direction)
         fields.append(Field(name, volume, Material(color), (0.9, 1.1)))
     return Scene(tuple(fields), np.ones(3))
 
@@ -168,7 +170,8 @@ def test_an_empty_isosurface_is_background_only(local):
 
 
 def test_caps_are_drawn_in_a_plain_tone_whatever_the_light():
-    half = sampled(lambda x: 1.2 - np.linalg.norm(x, axis=1), (20, 12, 20), (-1, 0, -1), (0.105,) * 3)  # cut open at the front
+    # cut open at the front
+    half = sampled(lambda x: 1.2 - np.linalg.norm(x, axis=1), (20, 12, 20), (-1, 0, -1), (0.105,) * 3)
     pictures = [render(lit(sky(half, albedo=(0.9, 0.6, 0.3)), value), **SIZE) for value in (0.5, 2.0)]
     cap = encode_srgb(CAP_TONE * np.array([0.9, 0.6, 0.3]))
     plain = (pictures[0] == cap).all(axis=2)
@@ -191,7 +194,8 @@ def test_the_light_on_show_is_that_of_the_field_and_the_place():
     values[4:, :, :, 1] = 1  # the half at +x is green
     picture = render(light, **SIZE).astype(int)
     left = np.flatnonzero(is_object(picture)[45])[1]
-    assert picture[45, left, 0] > 100 > picture[45, left, 1]  # seen from 30 degrees to the right: +x is in the middle too
+    # seen from 30 degrees to the right: +x is in the middle too
+    assert picture[45, left, 0] > 100 > picture[45, left, 1]
     assert picture[45, 60, 1] > 100 > picture[45, 60, 0]
 
 
@@ -207,7 +211,7 @@ def test_local_light_is_a_lamp_at_the_camera_and_knows_nothing_of_the_grid():
     radius = np.ptp(seen) / 2
     for share in (0.3, 0.6, 0.8):
         facing = np.sqrt(1 - share**2)  # of a sphere far away
-        side = row[int(round(middle + share * radius))], row[int(round(middle - share * radius))]
+        side = row[round(middle + share * radius)], row[round(middle - share * radius)]
         assert np.mean(side) == pytest.approx(float(encode_srgb(np.array([WHITE * facing]))[0]), abs=8)
 
 

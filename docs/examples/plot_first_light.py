@@ -2,41 +2,36 @@
 First light
 ===========
 
-Light a scene once, then draw three of its isosurfaces without asking for light again.
+Light a scene once, then draw any of its isosurfaces without asking for light again.
 
-The scene is built in: the proton and neutron densities of a small nucleus under a white sky. The settings are coarse,
-to be quick.
+The scene is built in: the proton and neutron densities of a small nucleus. The settings are coarse, to be quick.
 """
 
 import matplotlib.pyplot as plt
-import numpy as np
-from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 import illumgrid as ig
+from illumgrid import preview
 from illumgrid.demo import nucleus
 
 scene = nucleus()
-light = ig.run(scene, grid=24, paths=16)
+light = ig.run(scene, grid=40, paths=64)
 
 # %%
 # One row of ``scene.levels`` is one setting of all sliders: an isovalue for each field, from the lowest of its range at
-# 0 to the highest at 1. Each isosurface is lit by looking up its light at the middle of each of its faces.
+# 0 to the highest at 1. The pictures differ in nothing but that setting: the light was computed before.
 
-settings = [0.1, 0.5, 0.9]
-figure, axes = plt.subplots(1, 3, figsize=(9, 3.4), subplot_kw={"projection": "3d"})
-for ax, t, row in zip(axes, settings, scene.levels(settings)):
-    triangles, colors = [], []
-    for field, isovalue in zip(scene.fields, row):
-        mesh = ig.isosurface(field.volume, isovalue, inside=field.inside)
-        triangles.append(mesh.triangles)
-        colors.append(light.color(mesh.triangles_center, field=field.name) / 255)
-    corners = np.concatenate(triangles)
-    # Each triangle is outlined in its own colour, or the background shines through the seams.
-    shades = np.concatenate(colors)
-    ax.add_collection3d(Poly3DCollection(corners, facecolors=shades, edgecolors=shades, linewidths=0.2))
-    low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
-    ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]), title=f"t = {t}")
-    ax.set_box_aspect(high - low)
+figure, axes = plt.subplots(1, 3, figsize=(10.5, 3.2))
+for ax, t, row in zip(axes, (0.1, 0.5, 0.9), scene.levels([0.1, 0.5, 0.9])):
+    ax.imshow(preview.render(light, isovalue=row[0], width=480, height=360))
+    ax.set_title(f"isovalue {row[0]:.2f}")
     ax.set_axis_off()
 figure.tight_layout()
+plt.show()
+
+# %%
+# Under a lamp at the camera alone, near and far look alike.
+
+figure, ax = plt.subplots(figsize=(3.6, 2.8))
+ax.imshow(preview.render(light, width=480, height=360, local=True))
+ax.set_axis_off()
 plt.show()

@@ -108,6 +108,12 @@ def _volume_scene(
     return Scene.sky(volume, albedo, limits, inside, volume_name(source))
 
 
+def _smoothed(scene: "Scene", sigma: float) -> "Scene":
+    from illumgrid.volume import smooth as blur
+
+    return replace(scene, fields=tuple(replace(f, volume=blur(f.volume, sigma)) for f in scene.fields))
+
+
 def _stage_options(settings: list[str]) -> dict[str, dict[str, str]]:
     """`STAGE.OPTION=VALUE` texts, by stage."""
     options: dict[str, dict[str, str]] = {"sampler": {}, "backend": {}, "interpolator": {}}
@@ -194,13 +200,13 @@ def run(
         if source is None or (source in SCENES and not Path(source).exists()):
             name = source or "nucleus"
             preset = SCENES[name]
-            if extra := _given(range=limits, inside=inside, albedo=albedo, smooth=smooth):
+            if extra := _given(range=limits, inside=inside, albedo=albedo):
                 raise BadInput(
                     f"{extra} came with the built-in scene {name!r}; expected a volume file with them: leave them out"
                 )
             folder = output or _default_folder(name)
             store.claim(folder, overwrite)
-            scene, grid, paths = preset.make(), grid or preset.grid, paths or preset.paths
+            scene, grid, paths = _smoothed(preset.make(), smooth or 0.0), grid or preset.grid, paths or preset.paths
         else:
             if inside not in (None, "above", "below"):
                 raise BadInput(f"--inside is {inside!r}; expected above or below")

@@ -195,13 +195,13 @@ class Scene:
         return cls((Field(name, volume, Material(np.asarray(albedo)), range, inside),), np.ones(3))  # type: ignore[arg-type]
 
     def levels(self, t: ArrayLike) -> Floats:
-        """Settings (n, F) of all sliders for t (n,) from 0, each field's lowest isovalue, to 1, its highest (clamped)."""
+        """Settings (n, F) of all sliders for t (n,) from 0, the lowest isovalues, to 1, the highest (clamped)."""
         low, high = np.array([f.range for f in self.fields]).T
         share = np.clip(np.atleast_1d(np.asarray(t, float)), 0.0, 1.0)[:, None]
-        return (1 - share) * low + share * high
+        return np.asarray((1 - share) * low + share * high)
 
     def levels_through(self, field: int, isovalues: ArrayLike) -> Floats:
-        """Settings (n, F) with field number `field` at `isovalues` (n,), the other sliders as the common sweep has them."""
+        """Settings (n, F) with field number `field` at `isovalues` (n,), the others as the common sweep has them."""
         own = np.atleast_1d(np.asarray(isovalues, float))
         low, high = self.fields[field].range
         rows = self.levels((own - low) / (high - low))

@@ -247,6 +247,12 @@ def project(volume: Volume, index: Floats, isovalues: Floats) -> tuple[Floats, N
         here = at[moving]
         miss = isovalues[moving] - interpolate(volume, here)
         slope = cell_gradient(volume, here)
+        for axis in range(3):  # across a plane of voxels this component jumps: the mean of both cells favours neither
+            on = (here[:, axis] == np.floor(here[:, axis])) & (here[:, axis] > 0) & (here[:, axis] < top[axis])
+            if on.any():
+                before = here[on]
+                before[:, axis] = np.nextafter(before[:, axis], 0.0)
+                slope[on, axis] = 0.5 * (slope[on, axis] + cell_gradient(volume, before)[:, axis])
         flat = ~slope.any(axis=1)
         if flat.any():  # at the edge of a plateau the way out is known to the central differences only
             slope[flat] = smooth_gradient(volume, here[flat])

@@ -51,7 +51,8 @@ class Numba:
         point, normal, level = in_frame(scene, queries)
 
         def chunk(rows: slice) -> None:
-            with np.errstate(over="ignore"):  # random numbers wrap around, on purpose; without the JIT NumPy sees it
+            # Random numbers wrap around and misses are infinite, on purpose; without the JIT NumPy would warn of it.
+            with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
                 solve_queries(
                     fields, queries.id[rows], point[rows], normal[rows], level[rows], queries.target[rows],
                     paths.start, len(paths), bounces, np.uint64(seed), mean[rows], m2[rows], count[rows],

@@ -33,7 +33,7 @@ def index_of(scene: Marchable, f: int, x: Floats) -> Floats:
     """Index coordinates (n, 3) of frame points, on a plane of voxels where they nearly are."""
     u = (x - scene.origin[f]) / scene.spacing[f]
     nearest = np.round(u)
-    return np.where(np.abs(u - nearest) < ON_A_VOXEL, nearest, u)
+    return np.asarray(np.where(np.abs(u - nearest) < ON_A_VOXEL, nearest, u))
 
 
 def cubic(v: NDArray[np.float32], level: Floats, cell: Ints, e: Floats, d: Floats) -> Floats:
