@@ -43,7 +43,7 @@ def nucleus() -> Scene:
             Field("protons", spread(nucleons(8, 0.0)), protons, limits),
             Field("neutrons", spread(nucleons(9, 1.2)[:8]), neutrons, limits),
         ),
-        np.ones(3),
+        background=np.ones(3),
     )
 
 

@@ -1,7 +1,7 @@
 """A level set, as a mesh and as something to march through."""
 
 import weakref
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -90,9 +90,16 @@ class Marchable(NamedTuple):
     bricks: NDArray[np.float32]  # largest v of each brick, all fields, C order
     brick_start: NDArray[np.int64]  # (F,)
     brick_shape: NDArray[np.int64]  # (F, 3)
-    albedo: Floats  # (F, 3)
-    emission: Floats  # (F, 3)
+    albedo: Floats  # (F + Q, 3): fields, then quads
+    emission: Floats  # (F + Q, 3)
     background: Floats  # (3,)
+    quad_corner: Floats  # (Q, 3) in the frame, as all that follows
+    quad_edges: Floats  # (Q, 2, 3)
+    quad_duals: Floats  # (Q, 2, 3): dot with a point from the corner gives its shares (0 to 1) along the edges
+    quad_normal: Floats  # (Q, 3) towards the front
+    lamps: NDArray[np.int64]  # (L,) numbers of the quads that emit
+    lamp_share: Floats  # (L,) running sum of the probability to choose a lamp, in proportion to its power
+    lamp_density: Floats  # (Q,) probability to choose a point of the quad, per area; 0 if it does not emit
 
 
 _turned: "weakref.WeakKeyDictionary[Volume, dict[Side, tuple[NDArray[np.float32], NDArray[np.float32]]]]"
@@ -134,10 +141,33 @@ def marchable(scene: Scene) -> Marchable:
         bricks=bricks[0] if len(parts) == 1 else np.concatenate(bricks),
         brick_start=np.cumsum([0, *(len(b) for b in bricks)], dtype=np.int64)[:-1],
         brick_shape=np.array([p[1].shape for p in parts], dtype=np.int64),
-        albedo=np.array([f.material.albedo for f in scene.fields]),
-        emission=np.array([f.material.emission for f in scene.fields]),
+        albedo=np.array([part.material.albedo for part in (*scene.fields, *scene.quads)]),
+        emission=np.array([part.material.emission for part in (*scene.fields, *scene.quads)]),
         background=np.array(scene.background),
+        **_quads_in_frame(scene),
     )
+
+
+def _quads_in_frame(scene: Scene) -> dict[str, NDArray[Any]]:
+    """The quad and lamp arrays of a `Marchable`."""
+    axes, count = scene.fields[0].volume.direction, len(scene.quads)
+    # The front is a side in the world: where the axes are mirrored it is not edge_u x edge_v of the frame.
+    normal = np.array([q.normal for q in scene.quads]).reshape(count, 3) @ axes
+    edges = np.array([(q.edge_u, q.edge_v) for q in scene.quads]).reshape(count, 2, 3) @ axes
+    across = np.cross(edges[:, ::-1], normal[:, None])
+    area = np.array([q.area for q in scene.quads])
+    power = np.array([q.material.emission.mean() * q.area for q in scene.quads]).reshape(count)
+    lamps = np.flatnonzero(power > 0)
+    chance = power / power.sum() if len(lamps) else power
+    return {
+        "quad_corner": scene.to_frame(np.array([q.corner for q in scene.quads]).reshape(count, 3)),
+        "quad_edges": edges,
+        "quad_duals": across / (edges * across).sum(axis=2, keepdims=True),
+        "quad_normal": normal,
+        "lamps": lamps,
+        "lamp_share": np.cumsum(chance[lamps]),
+        "lamp_density": chance / area if count else power,
+    }
 
 
 def upward(scene: Scene) -> Floats:

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from illumgrid.errors import BadInput
-from illumgrid.volume import Floats, Side, Volume, finite
+from illumgrid.volume import Floats, Side, Volume, finite, index_to_world
 
 
 def _rgb(value: ArrayLike, name: str, at_most: float) -> Floats:
@@ -134,6 +134,58 @@ class Field:
 
 
 @dataclass(frozen=True, eq=False)
+class Quad:
+    """A parallelogram: a wall, a floor, a luminaire.
+
+    It reflects on both sides and emits on its front only, the side of edge_u × edge_v in the world.
+
+    Parameters
+    ----------
+    name : str
+    corner, edge_u, edge_v : (3,) array_like
+        World position of one corner, and the two edges from there.
+    material : Material
+    texels : (2,) tuple of int
+        Texels of its light along edge_u and edge_v.
+    """
+
+    name: str
+    corner: Floats
+    edge_u: Floats
+    edge_v: Floats
+    material: Material = field(default_factory=Material)
+    texels: tuple[int, int] = (16, 16)
+
+    def __post_init__(self) -> None:
+        if not (isinstance(self.name, str) and self.name and self.name.isprintable()):
+            raise BadInput(f"a quad's name is {self.name!r}; expected a printable text")
+        for name in ("corner", "edge_u", "edge_v"):
+            vector = np.array(getattr(self, name), dtype=float)
+            if vector.shape != (3,) or not np.isfinite(vector).all():
+                raise BadInput(f"{name} of quad {self.name!r} is {vector.tolist()}; expected three finite numbers")
+            vector.setflags(write=False)
+            object.__setattr__(self, name, vector)
+        lengths = np.linalg.norm(self.edge_u) * np.linalg.norm(self.edge_v)
+        if not np.linalg.norm(np.cross(self.edge_u, self.edge_v)) > 1e-6 * lengths:
+            raise BadInput(f"the edges of quad {self.name!r} are parallel or zero; expected two that span an area")
+        texels = tuple(int(n) for n in self.texels)
+        if len(texels) != 2 or min(texels) < 1:
+            raise BadInput(f"texels of quad {self.name!r} are {self.texels}; expected two whole numbers from 1 up")
+        object.__setattr__(self, "texels", texels)
+
+    @property
+    def normal(self) -> Floats:
+        """Unit vector (3,) towards the front."""
+        across = np.cross(self.edge_u, self.edge_v)
+        return np.asarray(across / np.linalg.norm(across))
+
+    @property
+    def area(self) -> float:
+        """Area in squared world units."""
+        return float(np.linalg.norm(np.cross(self.edge_u, self.edge_v)))
+
+
+@dataclass(frozen=True, eq=False)
 class Levels:
     """A table of isovalues: row k is one setting of all sliders.
 
@@ -154,6 +206,8 @@ class Scene:
     ----------
     fields : sequence of Field
         At least one; their axes are parallel (equal `direction`), their names differ.
+    quads : sequence of Quad
+        Walls, floors, luminaires; their names differ from one another and from those of the fields.
     background : (3,) array_like
         Constant radiance from everywhere outside, linear RGB.
 
@@ -163,16 +217,17 @@ class Scene:
     """
 
     fields: tuple[Field, ...]
+    quads: tuple[Quad, ...] = ()
     background: Floats = field(default_factory=lambda: np.zeros(3))
 
     def __post_init__(self) -> None:
-        fields = tuple(self.fields)
+        fields, quads = tuple(self.fields), tuple(self.quads)
         if not fields:
             raise BadInput("the scene has no field; expected at least one")
-        names = [f.name for f in fields]
+        names = [part.name for part in (*fields, *quads)]
         for name in names:
             if names.count(name) > 1:
-                raise BadInput(f"two fields have the name {name!r}; expected names that differ")
+                raise BadInput(f"two parts of the scene have the name {name!r}; expected names that differ")
         for other in fields[1:]:
             if np.abs(other.volume.direction - fields[0].volume.direction).max() > 1e-6:
                 raise BadInput(
@@ -180,6 +235,7 @@ class Scene:
                     "expected one direction for all fields: resample one onto the lattice of the other"
                 )
         object.__setattr__(self, "fields", fields)
+        object.__setattr__(self, "quads", quads)
         object.__setattr__(self, "background", _rgb(self.background, "background", np.inf))
 
     @classmethod
@@ -192,7 +248,37 @@ class Scene:
         name: str = "field",
     ) -> "Scene":
         """One field under a white sky of radiance 1."""
-        return cls((Field(name, volume, Material(np.asarray(albedo)), range, inside),), np.ones(3))  # type: ignore[arg-type]
+        solid = Field(name, volume, Material(np.asarray(albedo)), range, inside)  # type: ignore[arg-type]
+        return cls((solid,), background=np.ones(3))
+
+    @classmethod
+    def floor(
+        cls,
+        volume: Volume,
+        albedo: ArrayLike = (0.8, 0.8, 0.8),
+        range: ArrayLike | None = None,
+        inside: Side = "above",
+        name: str = "field",
+    ) -> "Scene":
+        """One field on a white floor, under a white sky of radiance 1."""
+        scene = cls.sky(volume, albedo, range, inside, name)
+        right, front, up, centre, half = _upright_box(volume)
+        reach = 1.5 * half[:2].max()
+        ground = _wall("floor", centre - half[2] * up, reach * right, -reach * front, np.full(3, 0.75), (32, 32))
+        return cls(scene.fields, (ground,), scene.background)
+
+    @classmethod
+    def box(
+        cls,
+        volume: Volume,
+        albedo: ArrayLike = (0.8, 0.8, 0.8),
+        range: ArrayLike | None = None,
+        inside: Side = "above",
+        name: str = "field",
+    ) -> "Scene":
+        """One field in a closed box, red wall left, green wall right, a luminaire at the bottom (the paper's Figure 5)."""
+        fields = cls.sky(volume, albedo, range, inside, name).fields
+        return cls(fields, box_around(volume))
 
     def levels(self, t: ArrayLike) -> Floats:
         """Settings (n, F) of all sliders for t (n,) from 0, the lowest isovalues, to 1, the highest (clamped)."""
@@ -238,3 +324,50 @@ def level_table(scene: Scene, count: int) -> Levels:
     if count < 2:
         raise BadInput(f"{count} isovalues were asked for; expected at least 2")
     return Levels(scene.levels(np.linspace(0.0, 1.0, count)))
+
+
+def upright(direction: Floats) -> tuple[Floats, Floats, Floats]:
+    """World directions (3,) right, front, up along the axes of an array with this `direction`, in either sense.
+
+    Up is the axis nearest to world +z, front the one of the others nearest to -y (the face, in medical coordinates).
+    """
+    heights = direction[2]
+    vertical = int(np.argmax(np.abs(heights)))
+    depths = np.where(np.arange(3) == vertical, 0.0, -direction[1])
+    level = int(np.argmax(np.abs(depths)))
+    up = direction[:, vertical] * np.sign(heights[vertical])
+    front = direction[:, level] * (np.sign(depths[level]) or 1.0)
+    return np.cross(up, front), front, up
+
+
+def _upright_box(volume: Volume) -> tuple[Floats, Floats, Floats, Floats, Floats]:
+    """Right, front, up, and the centre and half extents (along those) of the box of a volume's voxel centres."""
+    axes = np.stack(upright(volume.direction), axis=1)
+    last = np.array(volume.shape) - 1.0
+    half = 0.5 * np.abs(axes.T @ (volume.direction * (last * volume.spacing))).sum(axis=1)
+    return axes[:, 0], axes[:, 1], axes[:, 2], index_to_world(volume, last / 2), half
+
+
+def _wall(name: str, centre: Floats, u: Floats, v: Floats, albedo: Floats, texels: tuple[int, int]) -> Quad:
+    """Parallelogram with half edges u and v about its centre; its front is u × v."""
+    return Quad(name, centre - u - v, 2 * u, 2 * v, Material(albedo), texels)
+
+
+def box_around(volume: Volume, margin: float = 0.25) -> tuple[Quad, ...]:
+    """Six walls that look inward at a volume, and a luminaire close above the floor; `margin` in half extents."""
+    right, front, up, centre, half = _upright_box(volume)
+    half = half + margin * half.max()
+    r, f, u = right * half[0], front * half[1], up * half[2]
+    white, red, green = np.full(3, 0.75), np.array([0.63, 0.06, 0.05]), np.array([0.14, 0.45, 0.09])
+    lamp = Quad(
+        "lamp", centre - 0.98 * u - 0.4 * r + 0.4 * f, 0.8 * r, -0.8 * f, Material(np.zeros(3), np.full(3, 8.0)), (4, 4)
+    )
+    return (
+        _wall("floor", centre - u, r, -f, white, (24, 24)),
+        _wall("ceiling", centre + u, r, f, white, (16, 16)),
+        _wall("left", centre - r, f, -u, red, (16, 16)),
+        _wall("right", centre + r, f, u, green, (16, 16)),
+        _wall("back", centre - f, r, u, white, (16, 16)),
+        _wall("front", centre + f, r, -u, white, (16, 16)),
+        lamp,
+    )

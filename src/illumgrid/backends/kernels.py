@@ -19,9 +19,11 @@ for _function in (mix, stream, draw):
 # No fastmath: a miss is t = inf, and the sign of a coefficient near zero decides the side.
 jit = numba.njit(cache=True, nogil=True, error_model="numpy")
 
-MISS, SURFACE, CAP, BURIED = 0, 1, 2, 3  # what a ray meets: nothing, a level set, a cap, the inside of a solid
+MISS, SURFACE, CAP, BURIED, QUAD = 0, 1, 2, 3, 4  # what a ray meets: nothing, a level set, a cap, a solid's inside, a quad
+DIMENSIONS = 8  # random numbers set aside for a segment of a path: 0, 1 its direction; 2, 3, 4 a point on a lamp
 BRICK_SHIFT = 2  # bricks of 4 cells a side, as in levelset.BRICK
 ON_A_VOXEL = 1e-7  # as in illumgrid.volume
+ON_A_WALL = 1e-10  # a wall reaches this share of its size farther, so that walls joined at an edge leave no gap
 
 
 @jit
@@ -252,22 +254,61 @@ def march(scene, f, level, ux, uy, uz, dx, dy, dz, on_surface, limit):
 
 
 @jit
-def nearest_hit(scene, level, x, y, z, dx, dy, dz, on, on_cap):
-    """First surface of any field along the frame ray x + t d, from the surface of field `on` (-1: from nowhere).
+def dot(a, b):
+    """Scalar product of two vectors (3,)."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
-    Returns (t, field, what, face). From a cap, the convex box of the field's own volume cannot be met again.
+
+@jit
+def meet_quad(scene, q, x, d):
+    """Distance t at which the frame ray x + t d meets quad q; inf if it does not.
+
+    A ray that comes from the front may start behind by a rounding error, as at the edge that two walls share: it meets
+    the quad at once.
     """
-    best, field, what, face = np.inf, -1, MISS, -1
-    for f in range(scene.start.shape[0]):
+    normal = scene.quad_normal[q]
+    approach = dot(normal, d)
+    if approach == 0.0:
+        return np.inf
+    ox, oy, oz = x[0] - scene.quad_corner[q, 0], x[1] - scene.quad_corner[q, 1], x[2] - scene.quad_corner[q, 2]
+    t = -(normal[0] * ox + normal[1] * oy + normal[2] * oz) / approach
+    size = abs(ox) + abs(oy) + abs(oz)
+    if t < 0.0:
+        if approach > 0.0 or -t * -approach > ON_A_WALL * size:
+            return np.inf
+        t = 0.0
+    at = (ox + t * d[0], oy + t * d[1], oz + t * d[2])
+    u, v = dot(scene.quad_duals[q, 0], at), dot(scene.quad_duals[q, 1], at)
+    if -ON_A_WALL <= u <= 1.0 + ON_A_WALL and -ON_A_WALL <= v <= 1.0 + ON_A_WALL:
+        return t
+    return np.inf
+
+
+@jit
+def nearest_hit(scene, level, x, d, on, on_cap):
+    """First surface along the frame ray x + t d, from surface number `on` (-1: from nowhere): (t, number, what, face).
+
+    Fields count from 0, quads follow. A quad, and from a cap the convex box of a volume, cannot be met again; the level
+    set itself can.
+    """
+    fields = scene.start.shape[0]
+    best, number, what, face = np.inf, -1, MISS, -1
+    for q in range(scene.quad_corner.shape[0]):
+        if fields + q != on:
+            t = meet_quad(scene, q, x, d)
+            if t < best:
+                best, number, what, face = t, fields + q, QUAD, -1
+    for f in range(fields):
         if f == on and on_cap:
             continue
         sx, sy, sz = scene.spacing[f, 0], scene.spacing[f, 1], scene.spacing[f, 2]
-        ux, uy, uz = (x - scene.origin[f, 0]) / sx, (y - scene.origin[f, 1]) / sy, (z - scene.origin[f, 2]) / sz
-        ux, uy, uz = snap(ux), snap(uy), snap(uz)
-        t, hit, side = march(scene, f, level[f], ux, uy, uz, dx / sx, dy / sy, dz / sz, f == on, best)
+        ux = snap((x[0] - scene.origin[f, 0]) / sx)
+        uy = snap((x[1] - scene.origin[f, 1]) / sy)
+        uz = snap((x[2] - scene.origin[f, 2]) / sz)
+        t, hit, side = march(scene, f, level[f], ux, uy, uz, d[0] / sx, d[1] / sy, d[2] / sz, f == on, best)
         if hit != MISS and t < best:
-            best, field, what, face = t, f, hit, side
-    return best, field, what, face
+            best, number, what, face = t, f, hit, side
+    return best, number, what, face
 
 
 @jit
@@ -315,16 +356,22 @@ def gradient_normal(scene, f, ux, uy, uz):
 
 
 @jit
-def hit_normal(scene, f, what, face, x, y, z, dx, dy, dz):
-    """Outward normal where a ray met field f: the gradient normal, or that of the cap's face."""
+def hit_normal(scene, number, what, face, x, d):
+    """Normal where a ray met a surface: the gradient normal, that of the cap's face, or the side of the quad it came to."""
     if what == CAP:
         return (
-            -np.copysign(1.0, dx) if face == 0 else 0.0,
-            -np.copysign(1.0, dy) if face == 1 else 0.0,
-            -np.copysign(1.0, dz) if face == 2 else 0.0,
+            -np.copysign(1.0, d[0]) if face == 0 else 0.0,
+            -np.copysign(1.0, d[1]) if face == 1 else 0.0,
+            -np.copysign(1.0, d[2]) if face == 2 else 0.0,
         )
-    ux, uy, uz = x - scene.origin[f, 0], y - scene.origin[f, 1], z - scene.origin[f, 2]
-    return gradient_normal(scene, f, ux / scene.spacing[f, 0], uy / scene.spacing[f, 1], uz / scene.spacing[f, 2])
+    if what == QUAD:
+        normal = scene.quad_normal[number - scene.start.shape[0]]
+        side = -np.copysign(1.0, dot(normal, d))
+        return side * normal[0], side * normal[1], side * normal[2]
+    ux = (x[0] - scene.origin[number, 0]) / scene.spacing[number, 0]
+    uy = (x[1] - scene.origin[number, 1]) / scene.spacing[number, 1]
+    uz = (x[2] - scene.origin[number, 2]) / scene.spacing[number, 2]
+    return gradient_normal(scene, number, ux, uy, uz)
 
 
 @jit
@@ -360,36 +407,87 @@ def holds(scene, f, level, ux, uy, uz):
 
 
 @jit
-def buried(scene, level, x, y, z, own):
+def buried(scene, level, x, own):
     """Whether the frame point x lies inside the solid of a field other than `own`."""
     for f in range(scene.start.shape[0]):
-        if f == own:
-            continue
-        ux = snap((x - scene.origin[f, 0]) / scene.spacing[f, 0])
-        uy = snap((y - scene.origin[f, 1]) / scene.spacing[f, 1])
-        uz = snap((z - scene.origin[f, 2]) / scene.spacing[f, 2])
-        if holds(scene, f, level[f], ux, uy, uz):
+        ux = snap((x[0] - scene.origin[f, 0]) / scene.spacing[f, 0])
+        uy = snap((x[1] - scene.origin[f, 1]) / scene.spacing[f, 1])
+        uz = snap((x[2] - scene.origin[f, 2]) / scene.spacing[f, 2])
+        if f != own and holds(scene, f, level[f], ux, uy, uz):
             return True
     return False
 
 
 @jit
-def walk(scene, key, path, bounces, level, own, x, y, z, nx, ny, nz):
-    """Worth (red, green, blue) of one path from a point on the level set of field `own`.
+def lamp_point(scene, choice, u, v):
+    """A point on a lamp, uniform by area: (quad, position), the lamp chosen in proportion to its power."""
+    lamp = 0
+    while lamp < scene.lamps.shape[0] - 1 and choice >= scene.lamp_share[lamp]:
+        lamp += 1
+    q = scene.lamps[lamp]
+    corner, along, across = scene.quad_corner[q], scene.quad_edges[q, 0], scene.quad_edges[q, 1]
+    return q, (
+        corner[0] + u * along[0] + v * across[0],
+        corner[1] + u * along[1] + v * across[1],
+        corner[2] + u * along[2] + v * across[2],
+    )
+
+
+@jit
+def lamp_density(scene, q, distance, d):
+    """Density per solid angle with which `lamp_point` finds a point of quad q's front at this distance along d."""
+    facing = -dot(scene.quad_normal[q], d)
+    return scene.lamp_density[q] * distance * distance / facing if facing > 0.0 else 0.0
+
+
+@jit
+def light_from_lamps(scene, key, path, segment, level, on, on_cap, x, n):
+    """Share of a lamp's emission that arrives at x from one point of one lamp, and the lamp: (weight, quad).
+
+    The weight is that of the balance heuristic: cosine density over the sum of both densities (Veach & Guibas 1995).
+    """
+    dimension = np.uint64(DIMENSIONS * segment)
+    choice = draw(key, path, dimension + np.uint64(4))
+    u, v = draw(key, path, dimension + np.uint64(2)), draw(key, path, dimension + np.uint64(3))
+    q, target = lamp_point(scene, choice, u, v)
+    wx, wy, wz = target[0] - x[0], target[1] - x[1], target[2] - x[2]
+    distance = np.sqrt(wx * wx + wy * wy + wz * wz)
+    if distance == 0.0:
+        return 0.0, q
+    d = (wx / distance, wy / distance, wz / distance)
+    by_cosine, by_lamp = dot(n, d) / np.pi, lamp_density(scene, q, distance, d)
+    number = scene.start.shape[0] + q
+    if by_cosine <= 0.0 or by_lamp <= 0.0 or number == on:
+        return 0.0, q
+    # The ray that meets this lamp first has met nothing else before.
+    _, met, _, _ = nearest_hit(scene, level, x, d, on, on_cap)
+    return (by_cosine / (by_cosine + by_lamp) if met == number else 0.0), q
+
+
+@jit
+def walk(scene, key, path, bounces, level, own, x, n):
+    """Worth (red, green, blue) of one path from the frame point x, with normal n, on surface number `own`.
 
     The irradiance there is π times the mean over the paths.
     """
     red, green, blue = 0.0, 0.0, 0.0
     keep_red, keep_green, keep_blue = 1.0, 1.0, 1.0  # throughput: share of the light that comes back along the path
-    on, on_cap = own, False
+    on, on_cap, fields = own, False, scene.start.shape[0]
     for segment in range(bounces + 1):
-        # Choose a direction by the cosine about the gradient normal.
-        u1 = draw(key, path, np.uint64(2 * segment))
-        u2 = draw(key, path, np.uint64(2 * segment + 1))
-        dx, dy, dz = cosine_direction(u1, u2, nx, ny, nz)
+        # Ask a lamp for its light, weighted against the chance that the ray below finds it.
+        if scene.lamps.shape[0] > 0:
+            weight, q = light_from_lamps(scene, key, path, segment, level, on, on_cap, x, n)
+            red += keep_red * weight * scene.emission[fields + q, 0]
+            green += keep_green * weight * scene.emission[fields + q, 1]
+            blue += keep_blue * weight * scene.emission[fields + q, 2]
+
+        # Choose a direction by the cosine about the normal.
+        u1 = draw(key, path, np.uint64(DIMENSIONS * segment))
+        u2 = draw(key, path, np.uint64(DIMENSIONS * segment + 1))
+        d = cosine_direction(u1, u2, n[0], n[1], n[2])
 
         # Follow the ray to the nearest surface; one that dips under its own has hit it already.
-        t, field, what, face = nearest_hit(scene, level, x, y, z, dx, dy, dz, on, on_cap)
+        t, number, what, face = nearest_hit(scene, level, x, d, on, on_cap)
 
         # A path that escapes sees the background, and ends.
         if what == MISS:
@@ -402,20 +500,25 @@ def walk(scene, key, path, bounces, level, own, x, y, z, nx, ny, nz):
         if what == BURIED:
             break
 
-        # Account for what the surface emits.
-        red += keep_red * scene.emission[field, 0]
-        green += keep_green * scene.emission[field, 1]
-        blue += keep_blue * scene.emission[field, 2]
+        # Account for what the surface emits: a quad on its front only, weighted if it is a lamp.
+        weight = 1.0
+        if what == QUAD:
+            by_cosine, by_lamp = dot(n, d) / np.pi, lamp_density(scene, number - fields, t, d)
+            front = dot(scene.quad_normal[number - fields], d) < 0.0
+            weight = by_cosine / (by_cosine + by_lamp) if front else 0.0
+        red += keep_red * weight * scene.emission[number, 0]
+        green += keep_green * weight * scene.emission[number, 1]
+        blue += keep_blue * weight * scene.emission[number, 2]
 
         # Reflect: the albedo takes its share, and the path goes on from the hit.
-        keep_red *= scene.albedo[field, 0]
-        keep_green *= scene.albedo[field, 1]
-        keep_blue *= scene.albedo[field, 2]
-        on, on_cap = field, what == CAP
-        if t > 0.0:
-            x, y, z = x + t * dx, y + t * dy, z + t * dz
-            nx, ny, nz = hit_normal(scene, field, what, face, x, y, z, dx, dy, dz)
-            if nx == 0.0 and ny == 0.0 and nz == 0.0:
+        keep_red *= scene.albedo[number, 0]
+        keep_green *= scene.albedo[number, 1]
+        keep_blue *= scene.albedo[number, 2]
+        on, on_cap = number, what == CAP
+        if t > 0.0 or what == QUAD:
+            x = (x[0] + t * d[0], x[1] + t * d[1], x[2] + t * d[2])
+            n = hit_normal(scene, number, what, face, x, d)
+            if n[0] == 0.0 and n[1] == 0.0 and n[2] == 0.0:
                 break
     return red, green, blue
 
@@ -424,18 +527,16 @@ def walk(scene, key, path, bounces, level, own, x, y, z, nx, ny, nz):
 def solve_queries(scene, ids, point, normal, level, target, first, count, bounces, seed, mean, m2, paths):
     """Irradiance at queries in frame coordinates, from `count` paths from number `first` on; fills mean, m2, paths."""
     for i in range(ids.shape[0]):
-        x, y, z = point[i, 0], point[i, 1], point[i, 2]
-        nx, ny, nz = normal[i, 0], normal[i, 1], normal[i, 2]
-        if (nx == 0.0 and ny == 0.0 and nz == 0.0) or buried(scene, level[i], x, y, z, target[i]):
+        x, n = (point[i, 0], point[i, 1], point[i, 2]), (normal[i, 0], normal[i, 1], normal[i, 2])
+        if (n[0] == 0.0 and n[1] == 0.0 and n[2] == 0.0) or buried(scene, level[i], x, target[i]):
             continue
         key = stream(seed, ids[i])
         mean_r, mean_g, mean_b, m2_r, m2_g, m2_b = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-        for n in range(count):
-            path = np.uint64(first + n)
-            red, green, blue = walk(scene, key, path, bounces, level[i], target[i], x, y, z, nx, ny, nz)
+        for k in range(count):
+            red, green, blue = walk(scene, key, np.uint64(first + k), bounces, level[i], target[i], x, n)
             # Welford's update: the spread without cancellation.
             off_r, off_g, off_b = np.pi * red - mean_r, np.pi * green - mean_g, np.pi * blue - mean_b
-            mean_r, mean_g, mean_b = mean_r + off_r / (n + 1), mean_g + off_g / (n + 1), mean_b + off_b / (n + 1)
+            mean_r, mean_g, mean_b = mean_r + off_r / (k + 1), mean_g + off_g / (k + 1), mean_b + off_b / (k + 1)
             m2_r += off_r * (np.pi * red - mean_r)
             m2_g += off_g * (np.pi * green - mean_g)
             m2_b += off_b * (np.pi * blue - mean_b)
@@ -445,14 +546,23 @@ def solve_queries(scene, ids, point, normal, level, target, first, count, bounce
 
 
 @jit
-def cast_rays(scene, level, origin, direction, on, t, field, what, normal):
-    """First hits of frame rays (n, 3), all under one row of levels; t, field, what and normal are filled."""
+def cast_rays(scene, level, origin, direction, on, t, number, what, normal):
+    """First hits of frame rays (n, 3), all under one row of levels; fills t, number, what and normal.
+
+    Rays from nowhere (`on` is -1) are those of a camera: they see the fronts of quads only.
+    """
+    fields = scene.start.shape[0]
     for i in range(origin.shape[0]):
-        x, y, z = origin[i, 0], origin[i, 1], origin[i, 2]
-        dx, dy, dz = direction[i, 0], direction[i, 1], direction[i, 2]
-        t[i], field[i], what[i], face = nearest_hit(scene, level, x, y, z, dx, dy, dz, on, False)
-        if what[i] == SURFACE or what[i] == CAP:
-            hx, hy, hz = x + t[i] * dx, y + t[i] * dy, z + t[i] * dz
-            normal[i, 0], normal[i, 1], normal[i, 2] = hit_normal(
-                scene, field[i], what[i], face, hx, hy, hz, dx, dy, dz
-            )
+        x, d = (origin[i, 0], origin[i, 1], origin[i, 2]), (direction[i, 0], direction[i, 1], direction[i, 2])
+        through, start, passed = on, x, 0.0
+        t[i], number[i], what[i], face = nearest_hit(scene, level, x, d, on, False)
+        while on < 0 and what[i] == QUAD and dot(scene.quad_normal[number[i] - fields], d) >= 0.0:
+            # A wall seen from behind is not there: go on from it.
+            passed += t[i]
+            through = number[i]
+            start = (x[0] + passed * d[0], x[1] + passed * d[1], x[2] + passed * d[2])
+            t[i], number[i], what[i], face = nearest_hit(scene, level, start, d, through, False)
+        t[i] += passed
+        if what[i] != MISS and what[i] != BURIED:
+            hit = (x[0] + t[i] * d[0], x[1] + t[i] * d[1], x[2] + t[i] * d[2])
+            normal[i, 0], normal[i, 1], normal[i, 2] = hit_normal(scene, number[i], what[i], face, hit, d)
