@@ -147,6 +147,9 @@ def test_a_built_in_scene_needs_no_data(call, tmp_path):
     call("run", "nucleus", "--grid", "6", "--paths", "1", "--no-preview", "-o", "again")
     assert recipe(tmp_path / "again")["input"] == "nucleus"
     assert len(ig.load(tmp_path / "again").grids) == 2
+    call("run", "nucleus", "--grid", "6", "--paths", "1", "--smooth", "2", "--no-preview", "-o", "calm")
+    calm, sharp = (ig.load(tmp_path / name).scene.fields[0].volume.values for name in ("calm", "again"))
+    assert recipe(tmp_path / "calm")["smooth"] == 2 and calm.max() < sharp.max()
 
 
 def test_what_was_noted_during_a_run_is_kept_and_shown_again(call, tmp_path):
@@ -182,7 +185,7 @@ def test_what_was_noted_during_a_run_is_kept_and_shown_again(call, tmp_path):
         (("nucleus", "--range", "0", "1"), ["--range", "nucleus", "leave them out"]),
         (("--inside", "above"), ["--inside", "nucleus"]),
         (("--albedo", "1", "1", "1"), ["--albedo", "nucleus"]),
-        (("nucleus", "--smooth", "0", "--range", "0", "1"), ["--range, --smooth", "nucleus"]),
+        (("nucleus", "--albedo", "1", "1", "1", "--range", "0", "1"), ["--range, --albedo", "nucleus"]),
     ],
 )
 def test_bad_input_is_one_sentence_and_leaves_nothing(refuse, args, words):

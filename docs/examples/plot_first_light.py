@@ -21,7 +21,7 @@ light = ig.run(scene, grid=40, paths=64)
 # 0 to the highest at 1. The pictures differ in nothing but that setting: the light was computed before.
 
 figure, axes = plt.subplots(1, 3, figsize=(10.5, 3.2))
-for ax, t, row in zip(axes, (0.1, 0.5, 0.9), scene.levels([0.1, 0.5, 0.9])):
+for ax, row in zip(axes, scene.levels([0.1, 0.5, 0.9])):
     ax.imshow(preview.render(light, isovalue=row[0], width=480, height=360))
     ax.set_title(f"isovalue {row[0]:.2f}")
     ax.set_axis_off()

@@ -39,7 +39,7 @@ class Baked:
     queries : int
         Number of questions asked.
     holes : tuple of int
-        For each field, nodes within its range that no sample supports.
+        For each field, nodes that its isosurfaces can show and no sample supports.
     """
 
     grids: tuple[IlluminationGrid, ...]
@@ -53,12 +53,20 @@ def _answer(scene: Scene, backend: Backend, paths: range, bounces: int, seed: in
 
 
 def holes_within_range(scene: Scene, field: int, grid: IlluminationGrid) -> int:
-    """Nodes without support through which an isosurface of the range passes."""
+    """Nodes without support through which an isosurface of the range passes, outside the solids of other fields."""
     own = scene.fields[field]
     near = reachable(own, grid.spec)
     empty = near[grid.support.reshape(-1)[near] == 0]
-    level = interpolate(own.volume, world_to_index(own.volume, grid.spec.nodes(empty)))
-    return int(((level >= own.range[0]) & (level <= own.range[1])).sum())
+    nodes = grid.spec.nodes(empty)
+    level = interpolate(own.volume, world_to_index(own.volume, nodes))
+    seen = (level >= own.range[0]) & (level <= own.range[1])
+    for number, other in enumerate(scene.fields):
+        if number != field:
+            index = world_to_index(other.volume, nodes)
+            within = ((index >= 0) & (index <= np.array(other.volume.shape) - 1)).all(axis=1)
+            depth = interpolate(other.volume, index) - scene.levels_through(field, level)[:, number]
+            seen &= ~(within & ((depth >= 0) if other.inside == "above" else (depth <= 0)))
+    return int(seen.sum())
 
 
 def bake(

@@ -1,5 +1,6 @@
 """The command line: the only place that prints."""
 
+import math
 import sys
 import time
 import warnings
@@ -158,7 +159,7 @@ def run(
         int | None, typer.Option(min=1, metavar="N", help="Light paths from every query. [default: 64]")
     ] = None,
     bounces: Annotated[int, typer.Option(min=0, metavar="N", help="Reflections of a path.")] = 4,
-    seed: Annotated[int, typer.Option(min=0, metavar="N", help="Equal seeds give equal light.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=2**64 - 1, metavar="N", help="Equal seeds give equal light.")] = 0,
     interpolator: Annotated[str, typer.Option(help="From samples to nodes: nearest.")] = "nearest",
     grid: Annotated[
         int | None,
@@ -259,14 +260,14 @@ def preview(
 
     if output.suffix.lower() != ".png":
         raise BadInput(f"--output is {output.name!r}; expected a file name that ends in .png")
+    if isovalue is not None and not math.isfinite(isovalue):
+        raise BadInput(f"--isovalue is {isovalue}; expected a finite number")
     light = load(folder)
     number = 0 if field is None else light.scene.number_of(field)
     if isovalue is not None:
         low, high = light.scene.fields[number].range
         if not low <= isovalue <= high:
-            say(
-                f"note: the isovalue {isovalue:g} lies outside the range {low:g} to {high:g} of the light"
-            )
+            say(f"note: the isovalue {isovalue:g} lies outside the range {low:g} to {high:g} of the light")
     store.write_file(output, pictures.png(pictures.render(light, field, isovalue, local=local)))
     say(f"wrote {output}" + ("" if local else f" at exposure {light.exposure:.4g}"))
 
@@ -278,7 +279,8 @@ def histogram_line(volume: "Volume", width: int = 64) -> str:
     """Histogram of the finite values in a line of block characters; heights are logarithmic."""
     import numpy as np
 
-    counts, _ = np.histogram(volume.values[np.isfinite(volume.values)], width)
+    finite = volume.values[np.isfinite(volume.values)]
+    counts, _ = np.histogram(finite, width, (np.float64(finite.min()), np.float64(finite.max())))
     height = np.log1p(counts) / max(np.log1p(counts.max()), 1e-9)
     return "".join(BLOCKS[int(np.ceil(h * 8))] for h in height)
 
@@ -355,6 +357,8 @@ def guarded(command: Callable[[], Any]) -> int:
     """Exit code of a command."""
     try:
         code = command()
+        if code == 130:  # what typer makes of Ctrl-C
+            raise KeyboardInterrupt
         return code if isinstance(code, int) else 0
     except (typer.Abort, KeyboardInterrupt):
         say("illumgrid: stopped; nothing was written")

@@ -174,8 +174,8 @@ def run(
     for field, holes in zip(scene.fields, baked.holes):
         if holes:
             warnings.warn(
-                f"{holes} nodes within the range of field {field.name!r} got no light of their own (no normal, no "
-                "sample in reach, or inside another solid); they show that of the nearest node",
+                f"{holes} nodes within the range of field {field.name!r} got no light of their own (no normal, or no "
+                "sample in reach); they show that of the nearest node",
                 IllumgridWarning,
                 stacklevel=2,
             )

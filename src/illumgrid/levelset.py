@@ -66,8 +66,13 @@ def isosurface(volume: Volume, isovalue: float, inside: Side = "above", capped: 
         values = np.pad(values, 1, constant_values=np.float32(beyond))
     if not values.min() < level < values.max():
         return trimesh.Trimesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64))
-    # "descent": what is higher than the level is the object, and faces turn away from it.
-    index, faces, _, _ = marching_cubes(values, level, gradient_direction="descent" if inside == "above" else "ascent")
+    # scikit-image adds 2e-16 to every difference: scale by a power of two, or tiny fields are all epsilon.
+    exponent = int(np.frexp(float(values.max()) - float(values.min()))[1])
+    # It winds faces by the left hand: "ascent" turns them, by the right hand, away from what is higher.
+    index, faces, _, _ = marching_cubes(
+        np.ldexp(values, -exponent), float(np.ldexp(level, -exponent)),
+        gradient_direction="ascent" if inside == "above" else "descent",
+    )  # fmt: skip
     index = index.astype(float) - (1.0 if capped else 0.0)
     index = np.clip(index, 0.0, np.array(volume.shape) - 1.0)
     if np.linalg.det(volume.direction) < 0:

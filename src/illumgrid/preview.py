@@ -52,16 +52,27 @@ def _axis_towards(scene: Scene, world: Floats) -> Floats:
     return np.asarray(axes[:, best] * np.sign(along[best]))
 
 
+def _column_ends(values: NDArray[np.float32], level: float) -> Floats:
+    """Indices (m, 3) where the columns of `values` along the last axis enter and leave the solid {v >= level}."""
+    solid = values >= level
+    x, y = np.nonzero(solid.any(axis=2))
+    last = values.shape[2] - 1
+    found = []
+    for step, end in ((-1, solid.argmax(axis=2)[x, y]), (1, last - solid[:, :, ::-1].argmax(axis=2)[x, y])):
+        inner, outer = values[x, y, end].astype(float), values[x, y, np.clip(end + step, 0, last)].astype(float)
+        share = np.divide(inner - level, inner - outer, out=np.zeros_like(inner), where=inner > outer)  # none at a cap
+        found.append(np.stack([x, y, end + step * share], axis=1))
+    return np.concatenate(found)
+
+
 def _outline(scene: Scene, row: Floats) -> Floats:
     """World points (m, 3) whose hull is that of the solids under one row of levels; of the volumes if all are empty."""
     found = []
     for field, level in zip(scene.fields, row * upward(scene)):
-        solid = turned(field.volume, field.inside)[0] >= level
-        column = solid.any(axis=2)
-        low, high = solid.argmax(axis=2), solid.shape[2] - 1 - solid[:, :, ::-1].argmax(axis=2)
-        for end in (low, high):
-            x, y = np.nonzero(column)
-            found.append(index_to_world(field.volume, np.stack([x, y, end[x, y]], axis=1)))
+        values = turned(field.volume, field.inside)[0]
+        for axis in range(3):
+            ends = _column_ends(np.moveaxis(values, axis, 2), level)
+            found.append(index_to_world(field.volume, np.insert(ends[:, :2], axis, ends[:, 2], axis=1)))
     if not sum(map(len, found)):
         corners = np.array(list(np.ndindex(2, 2, 2)))
         found = [index_to_world(f.volume, corners * (np.array(f.volume.shape) - 1)) for f in scene.fields]

@@ -69,7 +69,7 @@ class Queries:
         if not 0 <= field < len(scene.fields):
             raise BadInput(f"field {field} was asked for; expected a number from 0 to {len(scene.fields) - 1}")
         own = scene.fields[field]
-        index = world_to_index(own.volume, world)
+        index = world_to_index(own.volume, np.where(np.isfinite(world), world, np.nan))  # an infinity is nowhere
         top = np.array(own.volume.shape) - 1
         good = np.asarray((np.isfinite(index) & (index >= 0) & (index <= top)).all(axis=1))
         index = np.where(good[:, None], index, 0.0)

@@ -62,10 +62,11 @@ def suggest_range(volume: Volume, inside: Side = "above") -> tuple[float, float,
     """
     from skimage.filters import threshold_otsu
 
-    lowest, highest = float(np.nanmin(volume.values)), float(np.nanmax(volume.values))
+    # np.float64, not float: NumPy keeps the edges of float32 values in float32, too few of them far from zero.
+    lowest, highest = np.float64(np.nanmin(volume.values)), np.float64(np.nanmax(volume.values))
     if not (np.isfinite(lowest) and np.isfinite(highest)):
         volume = finite(volume, inside)
-        lowest, highest = float(volume.values.min()), float(volume.values.max())
+        lowest, highest = np.float64(volume.values.min()), np.float64(volume.values.max())
     if lowest == highest:
         raise BadInput(f"the values are all {lowest:g}; expected a field that varies, or there is no isosurface")
     counts, edges = np.histogram(volume.values, 1024, (lowest, highest))

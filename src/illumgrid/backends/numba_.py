@@ -59,7 +59,8 @@ class Numba:
                 )  # fmt: skip
 
         threads = self.threads or cores()
-        size = max(16, min(1024, n // (8 * threads) + 1))
+        # Ctrl-C waits for the chunks at work: at most a million paths each.
+        size = max(1, min(1024, max(16, n // (8 * threads) + 1), (1 << 20) // len(paths)))
         chunks = [slice(i, i + size) for i in range(0, n, size)]
         if threads == 1 or len(chunks) == 1:
             for rows in chunks:

@@ -27,7 +27,7 @@ def near_samples(spec: GridSpec, points: Floats, reach: float) -> NDArray[np.boo
 
 @dataclass(frozen=True)
 class Nearest:
-    """The nearest sample within a cell's diagonal; nodes beyond are holes."""
+    """The nearest sample within a cell's diagonal, holes passed over; nodes beyond are holes."""
 
     name: ClassVar[str] = "nearest"
 
