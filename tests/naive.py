@@ -13,6 +13,8 @@ import numpy as np
 
 from illumgrid.rng import draw, stream
 
+WALL = 1e-10
+"""A wall reaches this share of its size farther than its corners say."""
 SNAP = 1e-7
 """A ray that starts this close to a plane of voxels, in index coordinates, starts on it."""
 
@@ -26,7 +28,7 @@ class Hit:
     t : float
         Distance along the ray.
     field : int
-        Number of the field that is hit.
+        Number of the surface that is hit: fields first, then quads.
     x : list of float
         Position in the frame.
     normal : list of float or None
@@ -268,6 +270,80 @@ def central_difference(solid, voxel, axis):
     return (solid.v(tuple(after)) - solid.v(tuple(before))) / (after[axis] - before[axis])
 
 
+# Walls and lamps.
+
+
+class Wall:
+    """One quad in the frame of the scene; its front is edge_u x edge_v in the world."""
+
+    def __init__(self, scene, number):
+        quad, axes = scene.quads[number], scene.fields[0].volume.direction
+        self.number = len(scene.fields) + number
+        self.corner = scene.to_frame(quad.corner).tolist()
+        self.u, self.v = (quad.edge_u @ axes).tolist(), (quad.edge_v @ axes).tolist()
+        self.normal = (np.cross(quad.edge_u, quad.edge_v) @ axes).tolist()
+        self.area = math.hypot(*self.normal)
+        self.normal = [c / self.area for c in self.normal]
+        self.emission = quad.material.emission
+
+    def power(self):
+        return float(self.emission.mean()) * self.area
+
+    def meet(self, x, d):
+        """Hit of a ray, or None: Cramer's rule for x + t d = corner + a u + b v."""
+        matrix = np.array([self.u, self.v, [-c for c in d]]).T
+        if sum(a * b for a, b in zip(self.normal, d)) == 0:
+            return None
+        offset = [x[i] - self.corner[i] for i in range(3)]
+        a, b, t = np.linalg.solve(matrix, offset)
+        approach = sum(a * b for a, b in zip(self.normal, d))
+        depth = sum(a * b for a, b in zip(self.normal, offset))
+        if t < 0 and approach < 0 and -depth <= WALL * sum(map(abs, offset)):
+            t, (a, b) = 0.0, np.linalg.lstsq(matrix[:, :2], np.array(offset), rcond=None)[0]
+        if t < 0 or not (-WALL <= a <= 1 + WALL and -WALL <= b <= 1 + WALL):
+            return None
+        side = -1.0 if approach > 0 else 1.0
+        return Hit(float(t), self.number, [x[i] + t * d[i] for i in range(3)], [side * c for c in self.normal])
+
+
+def lamps(scene):
+    """(wall, probability) of every quad that emits: in proportion to power."""
+    walls = [wall for k in range(len(scene.quads)) if (wall := Wall(scene, k)).power() > 0]
+    total = sum(wall.power() for wall in walls)
+    return [(wall, wall.power() / total) for wall in walls]
+
+
+def lamp_density(scene, number, distance, d):
+    """Probability per solid angle that `ask_a_lamp` looks along d, to a point of this quad at this distance."""
+    for wall, chance in lamps(scene):
+        facing = -sum(a * b for a, b in zip(wall.normal, d))
+        if wall.number == number and facing > 0:
+            return chance / wall.area * distance**2 / facing
+    return 0.0
+
+
+def ask_a_lamp(scene, levels, hit, u, v, choice):
+    """Radiance (3,) from one point of one lamp, by the balance heuristic, as a share of a cosine-distributed path."""
+    total = 0.0
+    for wall, chance in lamps(scene):  # noqa: B007
+        total += chance
+        if choice < total:
+            break
+    target = [wall.corner[i] + u * wall.u[i] + v * wall.v[i] for i in range(3)]
+    way = [target[i] - hit.x[i] for i in range(3)]
+    distance = math.hypot(*way)
+    if distance == 0 or wall.number == hit.field:
+        return np.zeros(3)
+    d = [c / distance for c in way]
+    by_cosine = sum(a * b for a, b in zip(hit.normal, d)) / math.pi
+    by_lamp = lamp_density(scene, wall.number, distance, d)
+    if by_cosine <= 0 or by_lamp <= 0:
+        return np.zeros(3)
+    met = first_hit(scene, levels, hit.x, d, on=hit)
+    seen = met is not None and met.field == wall.number
+    return wall.emission * by_cosine / (by_cosine + by_lamp) if seen else np.zeros(3)
+
+
 # Light.
 
 
@@ -290,7 +366,7 @@ def first_hit(scene, levels, x, d, on=None):
         None if the ray escapes. A hit without a normal carries no light.
     """
     x, d = [float(c) for c in x], [float(c) for c in d]
-    hits = []
+    hits = [Wall(scene, k).meet(x, d) for k in range(len(scene.quads)) if on is None or on.field != len(scene.fields) + k]
     for number in range(len(scene.fields)):
         solid = Solid(scene, levels, number)
         if on is None or on.field != number:
@@ -331,19 +407,34 @@ def path_worth(scene, query, path, bounces, seed):
     """Radiance (3,) that one path brings to a query (a `Queries` of length 1 that is no hole)."""
     with np.errstate(over="ignore"):
         key = stream(np.uint64(seed), query.id[0])
-        u = [float(draw(key, np.uint64(path), np.uint64(i))) for i in range(2 * bounces + 2)]
+        u = [[float(draw(key, np.uint64(path), np.uint64(8 * k + i))) for i in range(5)] for k in range(bounces + 1)]
     hit, worth, throughput = on_query(scene, query), np.zeros(3), np.ones(3)
     for k in range(bounces + 1):
-        d = cosine_direction(hit.normal, u[2 * k], u[2 * k + 1])
-        hit = first_hit(scene, query.level[0], hit.x, d, on=hit)
+        if lamps(scene):
+            worth = worth + throughput * ask_a_lamp(scene, query.level[0], hit, *u[k][2:])
+        d = cosine_direction(hit.normal, u[k][0], u[k][1])
+        start, hit = hit, first_hit(scene, query.level[0], hit.x, d, on=hit)
         if hit is None:
             return worth + throughput * scene.background
         if hit.normal is None:
             return worth
-        material = scene.fields[hit.field].material
-        worth = worth + throughput * material.emission
-        throughput = throughput * material.albedo
+        emission, albedo = surface(scene, hit, start, d)
+        worth = worth + throughput * emission
+        throughput = throughput * albedo
     return worth
+
+
+def surface(scene, hit, start, d):
+    """Emission towards the ray that came from `start` along d, weighted against `ask_a_lamp`, and albedo of a hit."""
+    if hit.field < len(scene.fields):
+        material = scene.fields[hit.field].material
+        return material.emission, material.albedo
+    quad = scene.quads[hit.field - len(scene.fields)]
+    if sum(a * b for a, b in zip(Wall(scene, hit.field - len(scene.fields)).normal, d)) >= 0:
+        return np.zeros(3), quad.material.albedo  # the back
+    by_cosine = sum(a * b for a, b in zip(start.normal, d)) / math.pi
+    by_lamp = lamp_density(scene, hit.field, hit.t, d)
+    return quad.material.emission * by_cosine / (by_cosine + by_lamp), quad.material.albedo
 
 
 def solve(scene, queries, paths, bounces, seed):

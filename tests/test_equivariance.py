@@ -139,7 +139,7 @@ def test_below_on_the_negative_is_above(values, backend):
     up = colored(furnace(Volume(values, spacing=SPACING)))
     field = up.fields[0]
     negative = Field(field.name, field.volume.with_values(-values), field.material, -field.range[::-1], "below")
-    down = Scene((negative,), up.background)
+    down = Scene((negative,), background=up.background)
     queries = on_voxels(up)
     mirrored = on_voxels(down)
     np.testing.assert_array_equal(queries.level, -mirrored.level)

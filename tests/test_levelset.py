@@ -188,7 +188,7 @@ def test_two_fields_lie_one_after_the_other_in_the_frame_of_the_first():
     one = Volume(random.random((5, 6, 7)), (1, 2, 3), UNEVEN, MIRRORED)
     two = Volume(random.random((9, 3, 4)), (4, 4, 4), UNEVEN * 2, MIRRORED)
     fields = (Field("a", one, Material((0.1, 0.2, 0.3), (1, 2, 3))), Field("b", two, inside="below"))
-    scene = Scene(fields, (0.4, 0.5, 0.6))
+    scene = Scene(fields, background=(0.4, 0.5, 0.6))
     layout = marchable(scene)
     for f, (volume, sign) in enumerate(((one, 1), (two, -1))):
         size, bricks = volume.values.size, turned(volume, fields[f].inside)[1]

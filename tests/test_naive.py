@@ -25,7 +25,7 @@ def noisy(shape=(6, 6, 6), top=10, seed=1, **placement):
 
 def furnace(volume, inside="above"):
     field = Field("noise", volume, Material(ALBEDO, 1 - ALBEDO), (2.5, 7.5), inside)
-    return Scene((field,), SKY)
+    return Scene((field,), background=SKY)
 
 
 def voxels(volume):
@@ -262,7 +262,7 @@ def two_fields():
     left = Field("left", linear((4, 4, 4), (-1, 0, 0)), Material(ALBEDO, (1, 2, 3)), (-2.5, -0.5))  # solid x <= -c
     volume = linear((7, 7, 7), (1, 0, 0), origin=(2.0, -1.0, -1.0), spacing=(1.0, 0.9, 0.9))
     right = Field("right", volume, Material((0.5, 0.5, 0.5), (4, 5, 6)), (1.0, 4.0))  # solid x >= 2 + c
-    return Scene((left, right), SKY)
+    return Scene((left, right), background=SKY)
 
 
 def test_light_goes_from_one_field_to_another():

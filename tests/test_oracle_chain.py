@@ -115,7 +115,7 @@ def test_paths_from_a_block_are_those_of_its_faces():
     tall = Field("tall", Volume(i), Material(ALBEDO, EMISSION), (0.5, 2.5))
     beside = Volume(j, origin=(4.0, -2.0, 1.0), spacing=(1, 1.5, 1))
     wide = Field("wide", beside, Material(EMISSION), (0.5, 3.5), "below")
-    scene = Scene((tall, wide), (1.0, 0.9, 0.6))
+    scene = Scene((tall, wide), background=(1.0, 0.9, 0.6))
     queries = everywhere(scene)[::9]
     caps = 0
     for path in range(6):

@@ -104,7 +104,7 @@ def test_nodes_in_range_ask_on_their_own_level_set_and_rim_nodes_at_an_end_of_th
 def test_direct_queries_of_two_fields_have_ids_of_their_own_and_come_in_batches(monkeypatch):
     monkeypatch.setattr(direct, "_BATCH", 50)
     fields = (Field("a", ball(8), range=(0.2, 0.6)), Field("b", ball(10), range=(0.5, 1.0)))
-    scene = Scene(fields, np.ones(3))
+    scene = Scene(fields, background=np.ones(3))
     specs = [GridSpec.over(f.volume, n) for f, n in zip(fields, (8, 6))]
     batches = list(Direct().queries(scene, specs, 0))
     assert len(batches) > 4 and all(0 < len(b) <= 50 and len(set(b.target.tolist())) == 1 for b in batches)
@@ -171,7 +171,7 @@ def test_equal_seeds_give_equal_points_and_others_do_not():
 
 def test_isovalues_of_the_first_field_take_the_others_along_and_whole_rows_stand_as_given():
     fields = (Field("a", ball(10), range=(0.2, 0.6)), Field("b", ball(12), range=(0.5, 0.9)))
-    scene = Scene(fields, np.ones(3))
+    scene = Scene(fields, background=np.ones(3))
     along = list(on_level_sets(scene, [0.3, 0.5], 0, points=10))
     assert [b.target[0] for b in along] == [0, 1, 0, 1]
     for batch, row in zip(along, [(0.3, 0.6)] * 2 + [(0.5, 0.8)] * 2):

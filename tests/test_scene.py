@@ -79,7 +79,7 @@ def test_a_field_replaces_what_is_not_finite_and_says_so():
 
 def test_a_scene_needs_a_field_and_names_that_differ():
     refused(lambda: Scene(()), "no field", "at least one")
-    refused(lambda: Scene((Field("a", ball()), Field("a", ball(12)))), "two fields", "'a'", "differ")
+    refused(lambda: Scene((Field("a", ball()), Field("a", ball(12)))), "two parts", "'a'", "differ")
 
 
 def test_fields_whose_axes_are_not_parallel_are_refused():

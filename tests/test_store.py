@@ -33,7 +33,7 @@ def example(count: int = 1, seed: int = 0, direction=MIRRORED) -> store.Stored:
         Field("protons", first, Material((0.1, 0.2, 1 / 3)), (-0.1, 0.7), "below"),
         Field("Dichte/ρ 名", second, Material((1, 0, 0.5), (0, 1e-300, 7e9)), (-1e19, 2e19), "above"),
     )[:count]
-    scene = Scene(fields, (0.1, 0, 1 / 3))
+    scene = Scene(fields, background=(0.1, 0, 1 / 3))
     grids = tuple(grid(GridSpec.over(f.volume, n), rng) for f, n in zip(fields, (9, 5)))
     recipe = {
         "seed": 2**70 + seed,

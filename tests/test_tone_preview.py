@@ -70,7 +70,7 @@ def three_balls(axes=(0, 1, 2), flips=(1, 1, 1)):
 
         volume = sampled(inside, tuple(shape), origin, spacing, direction)
         fields.append(Field(name, volume, Material(color), (0.9, 1.1)))
-    return Scene(tuple(fields), np.ones(3))
+    return Scene(tuple(fields), background=np.ones(3))
 
 
 def places(picture):

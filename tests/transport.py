@@ -43,14 +43,14 @@ def furnace(*volumes, inside="above", albedo=ALBEDO, share=(0.3, 0.7)):
         limits = volume.values.min() + np.array(share) * np.ptp(volume.values)
         side = inside if number == 0 else "below"
         fields.append(Field(f"field {number}", volume, Material(albedo, 1 - albedo), limits, side))
-    return Scene(tuple(fields), np.ones(3))
+    return Scene(tuple(fields), background=np.ones(3))
 
 
 def colored(scene, background=SKY):
     """The same solids with light by which paths can be told apart."""
     materials = [Material(ALBEDO, EMISSION), Material(ALBEDO[::-1], 0.5 * EMISSION[::-1])]
     fields = (Field(f.name, f.volume, m, f.range, f.inside) for f, m in zip(scene.fields, materials))
-    return Scene(tuple(fields), background)
+    return Scene(tuple(fields), background=background)
 
 
 def voxels(volume):

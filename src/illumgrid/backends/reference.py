@@ -19,7 +19,9 @@ from illumgrid.volume import ON_A_VOXEL, Floats
 Bools = NDArray[np.bool_]
 Ints = NDArray[np.int64]
 
-MISS, SURFACE, CAP, BURIED = 0, 1, 2, 3
+MISS, SURFACE, CAP, BURIED, QUAD = 0, 1, 2, 3, 4
+DIMENSIONS = 8  # random numbers set aside for a segment: 0, 1 its direction; 2, 3, 4 a point on a lamp
+ON_A_WALL = 1e-10  # a wall reaches this share of its size farther, so that walls joined at an edge leave no gap
 _CORNERS = np.array(list(np.ndindex(2, 2, 2)))
 
 
@@ -142,20 +144,41 @@ def march(v: NDArray[np.float32], level: Floats, u: Floats, d: Floats, on_surfac
     return t_hit, what, face
 
 
+def meet_quad(scene: Marchable, q: int, x: Floats, d: Floats) -> Floats:
+    """Distance (n,) at which frame rays meet quad q, inf if they do not.
+
+    A ray from the front may start behind by a rounding error, as at the edge that two walls share: it meets at once.
+    """
+    normal, offset = scene.quad_normal[q], x - scene.quad_corner[q]
+    approach = d @ normal
+    with np.errstate(divide="ignore", invalid="ignore"):
+        t = -(offset @ normal) / approach
+    late = (t < 0) & (approach < 0) & (t * approach <= ON_A_WALL * np.abs(offset).sum(axis=1))
+    t = np.where(late, 0.0, t)
+    with np.errstate(invalid="ignore"):
+        share = (offset + t[:, None] * d) @ scene.quad_duals[q].T
+    within = ((share >= -ON_A_WALL) & (share <= 1 + ON_A_WALL)).all(axis=1)
+    return np.where(within & (t >= 0) & (approach != 0), t, np.inf)
+
+
 def nearest_hit(
     scene: Marchable, level: Floats, x: Floats, d: Floats, on: Ints, on_cap: Bools
 ) -> tuple[Floats, Ints, Ints, Ints]:
-    """First surface of any field along the frame rays x + t d: (t, field, what, axis of a cap), each (n,)."""
-    n = len(x)
-    best, field, what, face = np.full(n, np.inf), np.full(n, -1), np.full(n, MISS), np.full(n, -1)
-    for f in range(len(scene.start)):
+    """First surface along the frame rays x + t d: (t, number, what, axis of a cap), each (n,); fields first, then quads."""
+    n, fields = len(x), len(scene.start)
+    best, number, what, face = np.full(n, np.inf), np.full(n, -1), np.full(n, MISS), np.full(n, -1)
+    for q in range(len(scene.quad_corner)):
+        t = np.where(on == fields + q, np.inf, meet_quad(scene, q, x, d))
+        closer = t < best
+        best[closer], number[closer], what[closer] = t[closer], fields + q, QUAD
+    for f in range(fields):
         ray = np.flatnonzero(~((on == f) & on_cap))  # from a cap, the convex box cannot be met again
         start = index_of(scene, f, x[ray])
         t, hit, axis = march(voxels(scene, f), level[ray, f], start, d[ray] / scene.spacing[f], on[ray] == f)
         closer = (hit != MISS) & (t < best[ray])
         ray = ray[closer]
-        best[ray], field[ray], what[ray], face[ray] = t[closer], f, hit[closer], axis[closer]
-    return best, field, what, face
+        best[ray], number[ray], what[ray], face[ray] = t[closer], f, hit[closer], axis[closer]
+    return best, number, what, face
 
 
 def gradient_normal(scene: Marchable, f: int, x: Floats) -> Floats:
@@ -197,6 +220,36 @@ def cosine_direction(u1: Floats, u2: Floats, normal: Floats) -> Floats:
     return np.asarray(local[0] * tangent + local[1] * bitangent + local[2] * normal)
 
 
+def lamp_density(scene: Marchable, q: Ints, distance: Floats, d: Floats) -> Floats:
+    """Density per solid angle (n,) with which lamps are asked at the points of quads q, at these distances along d."""
+    facing = -np.einsum("ij,ij->i", scene.quad_normal[q], d)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(facing > 0, scene.lamp_density[q] * distance * distance / facing, 0.0)
+
+
+def light_from_lamps(
+    scene: Marchable, u: Floats, level: Floats, on: Ints, on_cap: Bools, x: Floats, normal: Floats
+) -> tuple[Floats, Ints]:
+    """Share (n,) of a lamp's emission that arrives at x from one point of one lamp, and the number (n,) of the quad.
+
+    The lamp is chosen in proportion to its power, the point uniform by area, from the numbers u (n, 3). The weight is
+    that of the balance heuristic: cosine density over the sum of both densities (Veach & Guibas 1995).
+    """
+    lamp = np.minimum(np.searchsorted(scene.lamp_share, u[:, 2], side="right"), len(scene.lamps) - 1)
+    q = scene.lamps[lamp]
+    target = scene.quad_corner[q] + np.einsum("ni,nij->nj", u[:, :2], scene.quad_edges[q])
+    distance = np.linalg.norm(target - x, axis=1)
+    d = (target - x) / np.where(distance > 0, distance, 1.0)[:, None]
+    by_cosine, by_lamp = np.einsum("ij,ij->i", normal, d) / np.pi, lamp_density(scene, q, distance, d)
+    number = len(scene.start) + q
+    ask = np.flatnonzero((distance > 0) & (by_cosine > 0) & (by_lamp > 0) & (number != on))
+    # The ray that meets this lamp first has met nothing else before.
+    _, met, _, _ = nearest_hit(scene, level[ask], x[ask], d[ask], on[ask], on_cap[ask])
+    weight = np.zeros(len(x))
+    weight[ask] = np.where(met == number[ask], by_cosine[ask] / (by_cosine[ask] + by_lamp[ask]), 0.0)
+    return weight, number
+
+
 def walk(
     scene: Marchable,
     key: NDArray[np.uint64],
@@ -207,40 +260,53 @@ def walk(
     x: Floats,
     normal: Floats,
 ) -> Floats:
-    """Worth (n, 3) of one path from each point on a level set: the irradiance is π times the mean."""
+    """Worth (n, 3) of one path from each point of a surface: the irradiance is π times the mean."""
     worth, keep = np.zeros((len(x), 3)), np.ones((len(x), 3))  # keep: share of the light that comes back along the path
     x, normal, on, on_cap = x.copy(), normal.copy(), own.astype(np.int64), np.zeros(len(x), bool)
-    alive = np.arange(len(x))
+    alive, fields = np.arange(len(x)), len(scene.start)
     for segment in range(bounces + 1):
-        # Choose a direction by the cosine about the gradient normal.
-        u1 = draw(key[alive], np.uint64(path), np.uint64(2 * segment))
-        u2 = draw(key[alive], np.uint64(path), np.uint64(2 * segment + 1))
-        d = cosine_direction(u1, u2, normal[alive])
+        u = [draw(key[alive], np.uint64(path), np.uint64(DIMENSIONS * segment + k)) for k in range(5)]
+
+        # Ask a lamp for its light, weighted against the chance that the ray below finds it.
+        if len(scene.lamps):
+            at = (level[alive], on[alive], on_cap[alive], x[alive], normal[alive])
+            weight, number = light_from_lamps(scene, np.stack(u[2:], axis=1), *at)
+            worth[alive] += keep[alive] * weight[:, None] * scene.emission[number]
+
+        # Choose a direction by the cosine about the normal.
+        d = cosine_direction(u[0], u[1], normal[alive])
 
         # Follow the ray to the nearest surface; one that dips under its own has hit it already.
-        t, field, what, face = nearest_hit(scene, level[alive], x[alive], d, on[alive], on_cap[alive])
+        t, number, what, face = nearest_hit(scene, level[alive], x[alive], d, on[alive], on_cap[alive])
 
         # A path that escapes sees the background, and ends.
         escaped = alive[what == MISS]
         worth[escaped] += keep[escaped] * scene.background
 
         # A path inside a solid carries no light.
-        goes_on = (what == SURFACE) | (what == CAP)
-        alive, t, d, field, what, face = (array[goes_on] for array in (alive, t, d, field, what, face))
+        goes_on = (what != MISS) & (what != BURIED)
+        alive, t, d, number, what, face = (array[goes_on] for array in (alive, t, d, number, what, face))
 
-        # Account for what the surface emits.
-        worth[alive] += keep[alive] * scene.emission[field]
+        # Account for what the surface emits: a quad on its front only, weighted if it is a lamp.
+        weight, wall = np.ones(len(alive)), what == QUAD
+        quad = number[wall] - fields
+        by_cosine = np.einsum("ij,ij->i", normal[alive[wall]], d[wall]) / np.pi
+        approach = np.einsum("ij,ij->i", scene.quad_normal[quad], d[wall])
+        by_lamp = lamp_density(scene, quad, t[wall], d[wall])
+        weight[wall] = np.where(approach < 0, by_cosine / (by_cosine + by_lamp), 0.0)
+        worth[alive] += keep[alive] * weight[:, None] * scene.emission[number]
 
         # Reflect: the albedo takes its share, and the path goes on from the hit.
-        keep[alive] *= scene.albedo[field]
-        on[alive], on_cap[alive] = field, what == CAP
-        moved = t > 0
+        keep[alive] *= scene.albedo[number]
+        on[alive], on_cap[alive] = number, what == CAP
+        moved = (t > 0) | wall
         x[alive] += np.where(moved, t, 0.0)[:, None] * d
-        for f in range(len(scene.start)):
-            here = moved & (field == f) & (what == SURFACE)
+        for f in range(fields):
+            here = moved & (number == f) & (what == SURFACE)
             normal[alive[here]] = gradient_normal(scene, f, x[alive[here]])
         cap = moved & (what == CAP)
         normal[alive[cap]] = -np.sign(d[cap]) * (face[cap, None] == np.arange(3))
+        normal[alive[wall]] = -np.sign(approach)[:, None] * scene.quad_normal[quad]
         alive = alive[normal[alive].any(axis=1)]
     return worth
 
