@@ -58,6 +58,7 @@ class Numba:
                     paths.start, len(paths), bounces, np.uint64(seed), mean[rows], m2[rows], count[rows],
                 )  # fmt: skip
 
+        chunk(slice(0, 0))  # compiles here, where Ctrl-C is heard, and once
         threads = self.threads or cores()
         # Ctrl-C waits for the chunks at work: at most a million paths each.
         size = max(1, min(1024, max(16, n // (8 * threads) + 1), (1 << 20) // len(paths)))
