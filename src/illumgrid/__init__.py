@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from illumgrid.errors import BadInput, IllumgridWarning
-    from illumgrid.grid import GridSpec, IlluminationGrid
+    from illumgrid.grid import GridSpec, IlluminationGrid, WallTexture
     from illumgrid.illumination import Illumination, load, run
     from illumgrid.levelset import isosurface
     from illumgrid.readers import read_volume
     from illumgrid.registry import backend, interpolator, sampler
     from illumgrid.samples import Queries, Samples
-    from illumgrid.scene import Field, Levels, Material, Scene, suggest_range
+    from illumgrid.scene import Field, Levels, Material, Quad, Scene, suggest_range
     from illumgrid.volume import Volume
 
 __all__ = [
@@ -28,10 +28,12 @@ __all__ = [
     "IlluminationGrid",
     "Levels",
     "Material",
+    "Quad",
     "Queries",
     "Samples",
     "Scene",
     "Volume",
+    "WallTexture",
     "backend",
     "interpolator",
     "isosurface",
@@ -44,13 +46,13 @@ __all__ = [
 
 _HOMES = {
     "errors": ("BadInput", "IllumgridWarning"),
-    "grid": ("GridSpec", "IlluminationGrid"),
+    "grid": ("GridSpec", "IlluminationGrid", "WallTexture"),
     "illumination": ("Illumination", "load", "run"),
     "levelset": ("isosurface",),
     "readers": ("read_volume",),
     "registry": ("backend", "interpolator", "sampler"),
     "samples": ("Queries", "Samples"),
-    "scene": ("Field", "Levels", "Material", "Scene", "suggest_range"),
+    "scene": ("Field", "Levels", "Material", "Quad", "Scene", "suggest_range"),
     "volume": ("Volume",),
 }
 _HOME = {name: home for home, names in _HOMES.items() for name in names}

@@ -8,10 +8,10 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from illumgrid.grid import GridSpec, IlluminationGrid
-from illumgrid.samplers.direct import reachable
-from illumgrid.samples import Queries, Samples, join_samples
-from illumgrid.scene import Scene
+from illumgrid.grid import GridSpec, IlluminationGrid, WallTexture, fill_holes
+from illumgrid.samplers.direct import Direct, reachable
+from illumgrid.samples import Queries, Samples, join_queries, join_samples
+from illumgrid.scene import Levels, Quad, Scene
 from illumgrid.stages import Backend, Interpolator, Sampler
 from illumgrid.volume import interpolate, world_to_index
 
@@ -34,6 +34,8 @@ class Baked:
     ----------
     grids : tuple of IlluminationGrid
         One a field.
+    walls : tuple of WallTexture
+        One a quad.
     seconds : dict
         Wall time of each stage.
     queries : int
@@ -43,9 +45,38 @@ class Baked:
     """
 
     grids: tuple[IlluminationGrid, ...]
+    walls: tuple[WallTexture, ...]
     seconds: dict[str, float]
     queries: int
     holes: tuple[int, ...]
+
+
+def wall_queries(scene: Scene, levels: Levels) -> list[Queries]:
+    """Queries at the middles of the texels of every quad's front, for every row of levels: one batch a quad."""
+    batches = []
+    for number, quad in enumerate(scene.quads, len(scene.fields)):
+        nu, nv = quad.texels
+        rows, v, u = np.indices((len(levels.table), nv, nu)).reshape(3, -1)
+        point = quad.corner + ((u + 0.5) / nu)[:, None] * quad.edge_u + ((v + 0.5) / nv)[:, None] * quad.edge_v
+        batches.append(
+            Queries(
+                id=np.arange(len(rows), dtype=np.uint64) | np.uint64(number << 40),
+                point=point,
+                normal=np.tile(quad.normal, (len(rows), 1)),
+                level=levels.table[rows],
+                target=np.full(len(rows), number, np.int32),
+            )
+        )
+    return batches
+
+
+def _wall_texture(rows: int, quad: Quad, answer: Samples) -> WallTexture:
+    nu, nv = quad.texels
+    support = (answer.paths > 0).astype(np.float32).reshape(rows, nv, nu)
+    texel = np.linalg.norm(quad.edge_v) / nv, np.linalg.norm(quad.edge_u) / nu
+    # Another row is another setting of the sweep: look there last.
+    spacing = (1e3 * max(texel) * max(nu, nv), *texel)
+    return WallTexture(fill_holes(spacing, answer.mean.reshape(rows, nv, nu, 3), support), support)
 
 
 def _answer(scene: Scene, backend: Backend, paths: range, bounces: int, seed: int, queries: Queries) -> Samples:
@@ -69,9 +100,33 @@ def holes_within_range(scene: Scene, field: int, grid: IlluminationGrid) -> int:
     return int(seen.sum())
 
 
+def light_left_out(scene: Scene, backend: Backend, bounces: int, seed: int = 0) -> float:
+    """Share of all light that more than `bounces` reflections would add, from a few paths on a coarse grid.
+
+    The paths with more bounces begin as those with fewer, so that the difference is the light of the rest and not noise.
+    """
+    specs = [GridSpec.over(field.volume, 10) for field in scene.fields]
+    asked = join_queries([q for q in Direct().queries(scene, specs, seed) if len(q)])
+    asked = asked[:: max(1, len(asked) // 200)]
+    mean = [
+        float(backend.solve(scene, asked, paths=range(32), bounces=b, seed=seed).mean.mean())
+        for b in (bounces, 3 * bounces + 30)
+    ]
+    return 1.0 - mean[0] / mean[1] if mean[1] > 0 else 0.0
+
+
+def enough_bounces(scene: Scene, backend: Backend, seed: int = 0) -> int:
+    """Reflections to follow: 4 under an open sky, in a closed scene until less than 1 % of the light is left out."""
+    bounces = 4
+    while not scene.background.any() and bounces < 128 and light_left_out(scene, backend, bounces, seed) >= 0.01:
+        bounces += max(1, bounces // 4)
+    return bounces
+
+
 def bake(
     scene: Scene,
     specs: Sequence[GridSpec],
+    levels: Levels,
     sampler: Sampler,
     backend: Backend,
     interpolator: Interpolator,
@@ -82,13 +137,15 @@ def bake(
     map: Map = map,
     progress: Progress = lambda what, done, total: None,
 ) -> Baked:
-    """Compute the illumination grids of a scene.
+    """Compute the illumination grids of a scene, and the light of its walls.
 
     Parameters
     ----------
     scene : Scene
     specs : sequence of GridSpec
         The nodes, one lattice a field.
+    levels : Levels
+        Rows of the sweep at which the walls are lit.
     sampler, backend, interpolator
         Stage objects.
     paths : range
@@ -102,6 +159,7 @@ def bake(
     """
     clock = [time.perf_counter()]
     batches = [batch for batch in sampler.queries(scene, specs, seed) if len(batch)]
+    batches += wall_queries(scene, levels)
     clock.append(time.perf_counter())
 
     total, done = sum(len(batch) for batch in batches), 0
@@ -121,9 +179,11 @@ def bake(
         grids.append(interpolator.fill(samples, spec, number))
         del samples
         progress("grid", number + 1, len(specs))
+    walls = [_wall_texture(len(levels.table), quad, answer) for quad, answer in zip(scene.quads, answers)]
     clock.append(time.perf_counter())
     return Baked(
         grids=tuple(grids),
+        walls=tuple(walls),
         seconds=dict(zip(("sampler", "backend", "interpolator"), np.diff(clock).tolist())),
         queries=total,
         holes=tuple(holes_within_range(scene, n, grid) for n, grid in enumerate(grids)),

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from illumgrid.scene import Field, Material, Scene
+from illumgrid.scene import Field, Material, Scene, box_around
 from illumgrid.volume import Floats, Volume
 
 _VOXELS = 64
@@ -34,17 +34,15 @@ def nucleons(count: int, turn: float) -> Floats:
 
 
 def nucleus() -> Scene:
-    """Densities of eight protons and eight neutrons under a white sky (after Figure 7 of Banks & Beason 2007)."""
+    """Densities of eight protons and eight neutrons in a box with a luminaire (after Figure 7 of Banks & Beason 2007)."""
     protons = Material(np.array([0.85, 0.42, 0.28]))
     neutrons = Material(np.array([0.35, 0.55, 0.82]))
     limits = np.array([0.15, 0.75])
-    return Scene(
-        (
-            Field("protons", spread(nucleons(8, 0.0)), protons, limits),
-            Field("neutrons", spread(nucleons(9, 1.2)[:8]), neutrons, limits),
-        ),
-        background=np.ones(3),
+    fields = (
+        Field("protons", spread(nucleons(8, 0.0)), protons, limits),
+        Field("neutrons", spread(nucleons(9, 1.2)[:8]), neutrons, limits),
     )
+    return Scene(fields, box_around(fields[0].volume))
 
 
 @dataclass(frozen=True)

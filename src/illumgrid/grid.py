@@ -93,6 +93,35 @@ class IlluminationGrid:
         return read_lattice(self.spec, self.values, points)
 
 
+@dataclass(frozen=True, eq=False)
+class WallTexture:
+    """Light on the front of a quad, for every row of the level table.
+
+    Parameters
+    ----------
+    values : (K, nv, nu, 3) float32
+        Irradiance, linear RGB, at the middles of the texels: u along edge_u, v along edge_v.
+    support : (K, nv, nu) float32
+        1, or 0 for a texel inside a solid, which holds the value of the nearest one outside.
+    """
+
+    values: NDArray[np.float32]
+    support: NDArray[np.float32]
+
+    def lookup(self, u: ArrayLike, v: ArrayLike, t: ArrayLike) -> NDArray[np.float32]:
+        """Irradiance (n, 3) at shares u, v (n,) of the edges and t (n,) of the sweep, all 0 to 1; trilinear."""
+        from scipy.ndimage import map_coordinates
+
+        rows, nv, nu, _ = self.values.shape
+        place = np.broadcast_arrays(np.asarray(t) * (rows - 1), np.asarray(v) * nv - 0.5, np.asarray(u) * nu - 0.5)
+        result = np.zeros((place[0].size, 3), dtype=np.float32)
+        for channel in range(3):
+            map_coordinates(
+                self.values[..., channel], [p.ravel() for p in place], output=result[:, channel], order=1, mode="nearest"
+            )
+        return result
+
+
 def read_lattice(spec: Lattice, values: NDArray[np.float32], points: ArrayLike) -> NDArray[np.float32]:
     """Trilinear `values` (nx, ny, nz, m) at world points (n, 3), clamped to the border: (n, m)."""
     from scipy.ndimage import map_coordinates
@@ -105,12 +134,12 @@ def read_lattice(spec: Lattice, values: NDArray[np.float32], points: ArrayLike) 
     return result
 
 
-def fill_holes(spec: Lattice, values: NDArray[np.float32], support: NDArray[np.float32]) -> NDArray[np.float32]:
+def fill_holes(spacing: ArrayLike, values: NDArray[np.float32], support: NDArray[np.float32]) -> NDArray[np.float32]:
     """Give nodes of support 0 the value of the nearest supported node, so that lookup is never black and never NaN."""
     holes = support == 0
     if not holes.any() or holes.all():
         return values
     from scipy.ndimage import distance_transform_edt
 
-    nearest = distance_transform_edt(holes, sampling=spec.spacing, return_distances=False, return_indices=True)
+    nearest = distance_transform_edt(holes, sampling=np.asarray(spacing), return_distances=False, return_indices=True)
     return np.asarray(values[tuple(nearest)])

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from illumgrid import preview, registry, store, tone
-from illumgrid.bake import Map, Progress, bake
+from illumgrid.bake import Map, Progress, bake, enough_bounces, light_left_out
 from illumgrid.errors import BadInput, IllumgridWarning
-from illumgrid.grid import GridSpec, IlluminationGrid
+from illumgrid.grid import GridSpec, IlluminationGrid, WallTexture
 from illumgrid.scene import Levels, Scene, level_table
 from illumgrid.stages import Backend, Interpolator, Sampler
 
@@ -34,6 +34,8 @@ class Illumination:
         The table of isovalues.
     grids : tuple of IlluminationGrid
         One a field.
+    walls : tuple of WallTexture
+        One a quad.
     recipe : mapping
         How it was computed: stages, paths, seconds, versions; all of it JSON.
     """
@@ -41,6 +43,7 @@ class Illumination:
     scene: Scene
     levels: Levels
     grids: tuple[IlluminationGrid, ...]
+    walls: tuple[WallTexture, ...]
     recipe: Mapping[str, Any]
 
     def grid(self, field: str) -> IlluminationGrid:
@@ -87,7 +90,7 @@ class Illumination:
         store.claim(folder, overwrite)
         picture = _preview_png(self) if preview else None
         recipe = {**self.recipe, "exposure": self.exposure}
-        store.write(folder, store.Stored(self.scene, self.levels, self.grids, recipe), picture, overwrite)
+        store.write(folder, store.Stored(self.scene, self.levels, self.grids, self.walls, recipe), picture, overwrite)
 
 
 def _preview_png(light: Illumination) -> bytes:
@@ -97,7 +100,7 @@ def _preview_png(light: Illumination) -> bytes:
 def load(folder: str | os.PathLike[str]) -> Illumination:
     """Read what `Illumination.save` or ``illumgrid run`` wrote."""
     stored = store.read(folder)
-    return Illumination(stored.scene, stored.levels, stored.grids, stored.recipe)
+    return Illumination(stored.scene, stored.levels, stored.grids, stored.walls, stored.recipe)
 
 
 def _stage(kind: str, given: Any, options: dict[str, Any] | None = None) -> Any:
@@ -116,7 +119,7 @@ def run(
     interpolator: str | Interpolator = "nearest",
     grid: int | None = None,
     paths: int = 64,
-    bounces: int = 4,
+    bounces: int | None = None,
     isovalues: int | None = None,
     seed: int = 0,
     map: Map = map,
@@ -133,8 +136,9 @@ def run(
         Nodes along the axis with most voxels; by default as many as voxels, at most 128.
     paths : int
         Light paths from every query.
-    bounces : int
-        Reflections; 0 is light straight from the sky.
+    bounces : int, optional
+        Reflections; 0 is light straight from background and lamps. By default 4 under an open sky, and in a closed
+        scene as many as leave out less than 1 % of the light.
     isovalues : int, optional
         Rows of the level table, 32 by default; if given, also the count of a sampler that is named and has one.
     seed : int
@@ -160,8 +164,8 @@ def run(
     """
     if paths < 1:
         raise BadInput(f"{paths} paths were asked for; expected at least 1")
-    if bounces < 0:
-        raise BadInput(f"{bounces} bounces were asked for; expected 0 (light straight from the sky) or more")
+    if bounces is not None and bounces < 0:
+        raise BadInput(f"{bounces} bounces were asked for; expected 0 (light straight from the lamps) or more")
     if not 0 <= seed < 2**64:
         raise BadInput(f"the seed is {seed}; expected a whole number from 0 to 2**64 - 1")
     levels = level_table(scene, 32 if isovalues is None else isovalues)
@@ -170,7 +174,11 @@ def run(
         options["count"] = isovalues
     chosen = _stage("sampler", sampler, options), _stage("backend", backend), _stage("interpolator", interpolator)
     specs = [GridSpec.over(f.volume, min(max(f.volume.shape), LONGEST) if grid is None else grid) for f in scene.fields]
-    baked = bake(scene, specs, *chosen, paths=range(paths), bounces=bounces, seed=seed, map=map, progress=progress)
+    if bounces is None:
+        bounces = enough_bounces(scene, chosen[1], seed)
+    baked = bake(
+        scene, specs, levels, *chosen, paths=range(paths), bounces=bounces, seed=seed, map=map, progress=progress
+    )
     for field, holes in zip(scene.fields, baked.holes):
         if holes:
             warnings.warn(
@@ -184,6 +192,7 @@ def run(
         "grid": max(max(spec.shape) for spec in specs),
         "paths": paths,
         "bounces": bounces,
+        "left_out": light_left_out(scene, chosen[1], bounces, seed),
         "isovalues": len(levels.table),
         "seed": seed,
         "queries": baked.queries,
@@ -192,7 +201,7 @@ def run(
         "relative_error": _relative_error(baked.grids),
         "versions": {name: version(name) for name in ("illumgrid", "numpy", "numba", "scipy")},
     }
-    return Illumination(scene, levels, baked.grids, recipe)
+    return Illumination(scene, levels, baked.grids, baked.walls, recipe)
 
 
 def _relative_error(grids: tuple[IlluminationGrid, ...]) -> list[float | None]:

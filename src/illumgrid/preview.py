@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from illumgrid.levelset import Marchable, marchable, turned, upward
-from illumgrid.scene import Scene
+from illumgrid.scene import Scene, upright
 from illumgrid.tone import WHITE, encode_srgb
 from illumgrid.volume import Floats, index_to_world
 
@@ -44,14 +44,6 @@ class Camera:
     tangent: float
 
 
-def _axis_towards(scene: Scene, world: Floats) -> Floats:
-    """The direction along an axis of the array (either way) that is nearest to a world direction."""
-    axes = scene.fields[0].volume.direction
-    along = world @ axes
-    best = int(np.argmax(np.abs(along)))
-    return np.asarray(axes[:, best] * np.sign(along[best]))
-
-
 def _column_ends(values: NDArray[np.float32], level: float) -> Floats:
     """Indices (m, 3) where the columns of `values` along the last axis enter and leave the solid {v >= level}."""
     solid = values >= level
@@ -66,7 +58,7 @@ def _column_ends(values: NDArray[np.float32], level: float) -> Floats:
 
 
 def _outline(scene: Scene, row: Floats) -> Floats:
-    """World points (m, 3) whose hull is that of the solids under one row of levels; of the volumes if all are empty."""
+    """World points (m, 3) whose hull is that of the walls, and of the solids under a row of levels (volumes if none)."""
     found = []
     for field, level in zip(scene.fields, row * upward(scene)):
         values = turned(field.volume, field.inside)[0]
@@ -76,6 +68,8 @@ def _outline(scene: Scene, row: Floats) -> Floats:
     if not sum(map(len, found)):
         corners = np.array(list(np.ndindex(2, 2, 2)))
         found = [index_to_world(f.volume, corners * (np.array(f.volume.shape) - 1)) for f in scene.fields]
+    for quad in scene.quads:
+        found.append(quad.corner + np.array([np.zeros(3), quad.edge_u, quad.edge_v, quad.edge_u + quad.edge_v]))
     return np.concatenate(found)
 
 
@@ -83,14 +77,13 @@ def fit_camera(scene: Scene, row: Floats, aspect: float) -> Camera:
     """Camera that looks at the solids under one row of levels from the front, right and above, and just holds them.
 
     Up is the array axis nearest to world +z, the front the one nearest to -y (the face, in medical coordinates). What
-    is flat is seen from above.
+    is flat is seen from above; into a closed scene one looks straight.
     """
-    up = _axis_towards(scene, np.array([0.0, 0.0, 1.0]))
-    front = _axis_towards(scene, np.array([0.0, -1.0, 0.0]))
-    right = np.cross(up, front)  # as seen from the front
+    right, front, up = upright(scene.fields[0].volume.direction)
     outline = _outline(scene, row)
     extent = np.ptp(outline @ np.stack([right, front, up], axis=1), axis=0)
-    azimuth, elevation = np.radians(30.0), np.radians(60.0 if extent[2] < 0.5 * extent[:2].min() else 18.0)
+    flat, closed = extent[2] < 0.5 * extent[:2].min(), not scene.background.any()
+    azimuth, elevation = np.radians(0.0 if closed else 30.0), np.radians(60.0 if flat else 6.0 if closed else 18.0)
     forward = -np.cos(elevation) * (np.cos(azimuth) * front + np.sin(azimuth) * right) - np.sin(elevation) * up
     right = np.cross(forward, up)
     right /= np.linalg.norm(right)
@@ -127,12 +120,12 @@ def _rays(scene: Scene, camera: Camera, width: int, rows: range, height: int) ->
 
 
 def _shade(
-    light: "Illumination", fields: Marchable, row: Floats, rays: tuple[Floats, Floats], local: bool
+    light: "Illumination", fields: Marchable, row: Floats, share: float, rays: tuple[Floats, Floats], local: bool
 ) -> NDArray[np.float32]:
     """Display-linear colours (n, 3) of rays."""
     from illumgrid.backends.kernels import CAP, SURFACE, cast_rays
 
-    scene = light.scene
+    scene, fields_count = light.scene, len(light.scene.fields)
     origin, direction = rays
     n = len(origin)
     t, field, what, normal = np.zeros(n), np.zeros(n, np.int64), np.zeros(n, np.int64), np.zeros((n, 3))
@@ -148,6 +141,16 @@ def _shade(
         else:
             points = scene.from_frame(origin[lit] + t[lit, None] * direction[lit])
             color[lit] = light.grids[number].lookup(points) * (albedo / np.pi * light.exposure)
+    for number, quad in enumerate(scene.quads):
+        lit = np.flatnonzero(field == fields_count + number)
+        material = quad.material
+        if local:
+            facing = -np.einsum("ij,ij->i", normal[lit], direction[lit])
+            color[lit] = WHITE * np.maximum(material.albedo, material.emission.clip(0, 1)) * facing[:, None]
+        else:
+            at = (origin[lit] + t[lit, None] * direction[lit] - fields.quad_corner[number]) @ fields.quad_duals[number].T
+            shown = material.albedo / np.pi * light.walls[number].lookup(at[:, 0], at[:, 1], share) + material.emission
+            color[lit] = shown * light.exposure
     return color
 
 
@@ -177,11 +180,13 @@ def render(
     scene = light.scene
     number = 0 if field is None else scene.number_of(field)
     row = scene.levels(0.5)[0] if isovalue is None else scene.levels_through(number, isovalue)[0]
+    low, high = scene.fields[number].range
+    share = float(np.clip((row[number] - low) / (high - low), 0.0, 1.0))  # of the common sweep, as the walls know it
     camera = fit_camera(scene, row, width / height)
     fields = marchable(scene)
 
     def strip(rows: range) -> NDArray[np.float32]:
-        color = _shade(light, fields, row, _rays(scene, camera, width, rows, height), local)
+        color = _shade(light, fields, row, share, _rays(scene, camera, width, rows, height), local)
         pixels = np.clip(color, 0.0, 1.0).reshape(len(rows), SIDE, width, SIDE, 3)
         return np.asarray(pixels.mean(axis=(1, 3)))
 

@@ -1,9 +1,11 @@
 """A finished run on the disk: a folder with ``illumination.exr``, ``run.json`` and perhaps ``preview.png``.
 
-``illumination.exr`` is a multi-part OpenEXR file, float32, scan lines, ZIP. Each field has two parts:
+``illumination.exr`` is a multi-part OpenEXR file, float32, scan lines, ZIP. Each field has two parts,
 
 - ``light/<field name>``: channels R, G, B (irradiance), error and support of its illumination grid;
-- ``field/<field name>``: channel Y, the field's values as they were used.
+- ``field/<field name>``: channel Y, the field's values as they were used;
+
+and each quad one, ``wall/<quad name>``: channels R, G, B and support of its texels, (nu, nv, rows of the level table).
 
 A 3D array (nx, ny, nz) is an image nx wide and ny*nz high: row = z*ny + y, column = x. ``run.json`` says where the
 arrays lie in the world, and all else. Its ``checksum`` covers itself and the EXR file: the EXR library never sees a
@@ -27,13 +29,14 @@ import OpenEXR
 from numpy.typing import NDArray
 
 from illumgrid.errors import BadInput
-from illumgrid.grid import GridSpec, IlluminationGrid
-from illumgrid.scene import Field, Levels, Material, Scene
+from illumgrid.grid import GridSpec, IlluminationGrid, WallTexture
+from illumgrid.scene import Field, Levels, Material, Quad, Scene
 from illumgrid.volume import Lattice, Volume
 
 FORMAT = 1
 EXR, RUN, PREVIEW = "illumination.exr", "run.json", "preview.png"
 PLACE = ("origin", "spacing", "direction")
+EDGES = ("corner", "edge_u", "edge_v")
 LAYOUT = "array (nx, ny, nz) = ({}, {}, {}); row = z*ny + y, column = x"
 DEFLATE_AT_MOST = 1032  # bytes out for one byte in: a file that claims more is refused before memory is asked for
 ELSEWHERE = "choose another folder with -o"
@@ -54,12 +57,15 @@ class Stored:
     scene: Scene
     levels: Levels
     grids: tuple[IlluminationGrid, ...]
+    walls: tuple[WallTexture, ...]
     recipe: dict[str, Any]
 
     def __post_init__(self) -> None:
         fields, table = len(self.scene.fields), np.asarray(self.levels.table)
         if len(self.grids) != fields:
             raise BadInput(f"{len(self.grids)} grids came for {fields} fields; expected one each")
+        if len(self.walls) != len(self.scene.quads):
+            raise BadInput(f"{len(self.walls)} wall textures came for {len(self.scene.quads)} quads; expected one each")
         if table.ndim != 2 or not table.size or table.shape[1] != fields or not np.isfinite(table).all():
             raise BadInput(f"the level table has shape {table.shape}; expected finite isovalues, one column a field")
 
@@ -196,10 +202,16 @@ def _describe(stored: Stored) -> Record:
         | lattice(f.volume)
         for f in stored.scene.fields
     ]
+    quads = [
+        {"name": q.name, "texels": list(q.texels)}
+        | {name: getattr(q, name).tolist() for name in EDGES}
+        | {"albedo": q.material.albedo.tolist(), "emission": q.material.emission.tolist()}
+        for q in stored.scene.quads
+    ]
     record = {
         "format": FORMAT,
         "illumgrid": version("illumgrid"),
-        "scene": {"fields": fields, "background": stored.scene.background.tolist()},
+        "scene": {"fields": fields, "quads": quads, "background": stored.scene.background.tolist()},
         "levels": np.asarray(stored.levels.table, float).tolist(),
         "grids": {f.name: lattice(grid.spec) for f, grid in zip(stored.scene.fields, stored.grids)},
         "recipe": stored.recipe,
@@ -233,8 +245,15 @@ def _rebuild(record: Record, parts: dict[str, dict[str, Image]]) -> Stored:
         values = _array(parts.pop(f"field/{about['name']}")["Y"], _shape(about))
         volume, material = Volume(values, *(about[k] for k in PLACE)), Material(about["albedo"], about["emission"])
         fields.append(Field(about["name"], volume, material, about["range"], about["inside"]))
-    scene = Scene(tuple(fields), record["scene"]["background"])
-    return Stored(scene, Levels(np.array(record["levels"], float)), tuple(grids), record["recipe"])
+    quads, walls = [], []
+    for about in record["scene"]["quads"]:
+        texels, shape = parts.pop(f"wall/{about['name']}"), _wall_shape(about, record)
+        values, support = (_array(texels[c], shape).swapaxes(0, 2) for c in ("RGB", "support"))
+        walls.append(WallTexture(np.ascontiguousarray(values), np.ascontiguousarray(support)))
+        material = Material(about["albedo"], about["emission"])
+        quads.append(Quad(about["name"], *(about[k] for k in EDGES), material, tuple(about["texels"])))
+    scene = Scene(tuple(fields), tuple(quads), record["scene"]["background"])
+    return Stored(scene, Levels(np.array(record["levels"], float)), tuple(grids), tuple(walls), record["recipe"])
 
 
 def _shape(about: Record) -> tuple[int, int, int]:
@@ -244,11 +263,20 @@ def _shape(about: Record) -> tuple[int, int, int]:
     raise BadInput(f"the shape {str(about['shape'])[:80]} came; expected three whole numbers of at least 2")
 
 
+def _wall_shape(about: Record, record: Record) -> tuple[int, int, int]:
+    match about["texels"]:
+        case [int(nu), int(nv)] if min(nu, nv) >= 1:
+            return nu, nv, len(record["levels"])
+    raise BadInput(f"the texels {str(about['texels'])[:80]} came; expected two whole numbers of at least 1")
+
+
 def _plan(record: Record) -> Plan:
     plan: Plan = {}
     for about in record["scene"]["fields"]:
         plan[f"light/{about['name']}"] = _shape(record["grids"][about["name"]]), "B G R error support"
         plan[f"field/{about['name']}"] = _shape(about), "Y"
+    for about in record["scene"]["quads"]:
+        plan[f"wall/{about['name']}"] = _wall_shape(about, record), "B G R support"
     return plan
 
 
@@ -268,6 +296,9 @@ def _write_exr(path: Path, stored: Stored) -> None:
     for f, grid in zip(stored.scene.fields, stored.grids):
         arrays[f"light/{f.name}"] = {"RGB": grid.values, "error": grid.error, "support": grid.support}
         arrays[f"field/{f.name}"] = {"Y": f.volume.values}
+    for quad, wall in zip(stored.scene.quads, stored.walls):
+        turned = {"RGB": wall.values, "support": wall.support}
+        arrays[f"wall/{quad.name}"] = {channel: array.swapaxes(0, 2) for channel, array in turned.items()}
     shapes = [next(iter(channels.values())).shape for channels in arrays.values()]
     window = ((0, 0), (max(s[0] for s in shapes) - 1, max(s[1] * s[2] for s in shapes) - 1))  # all parts must share it
     common = {"type": OpenEXR.scanlineimage, "compression": OpenEXR.ZIP_COMPRESSION, "displayWindow": window}

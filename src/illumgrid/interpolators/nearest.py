@@ -57,5 +57,5 @@ class Nearest:
         shape = tuple(spec.shape)
         support = support.reshape(shape)
         return IlluminationGrid(
-            spec, fill_holes(spec, values.reshape(*shape, 3), support), error.reshape(shape), support
+            spec, fill_holes(spec.spacing, values.reshape(*shape, 3), support), error.reshape(shape), support
         )
