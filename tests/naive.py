@@ -11,7 +11,7 @@ from itertools import pairwise, product
 
 import numpy as np
 
-from illumgrid.rng import draw, stream
+from illumgrid.rng import draw, draw_pair, net_size, partner, stream
 
 WALL = 1e-10
 """A wall reaches this share of its size farther than its corners say."""
@@ -366,7 +366,8 @@ def first_hit(scene, levels, x, d, on=None):
         None if the ray escapes. A hit without a normal carries no light.
     """
     x, d = [float(c) for c in x], [float(c) for c in d]
-    hits = [Wall(scene, k).meet(x, d) for k in range(len(scene.quads)) if on is None or on.field != len(scene.fields) + k]
+    walls = [Wall(scene, k) for k in range(len(scene.quads))]
+    hits = [wall.meet(x, d) for wall in walls if on is None or on.field != wall.number]
     for number in range(len(scene.fields)):
         solid = Solid(scene, levels, number)
         if on is None or on.field != number:
@@ -407,11 +408,12 @@ def path_worth(scene, query, path, bounces, seed):
     """Radiance (3,) that one path brings to a query (a `Queries` of length 1 that is no hole)."""
     with np.errstate(over="ignore"):
         key = stream(np.uint64(seed), query.id[0])
-        u = [[float(draw(key, np.uint64(path), np.uint64(8 * k + i))) for i in range(5)] for k in range(bounces + 1)]
+        u = [[float(c) for c in draw_pair(key, np.uint64(path), np.uint64(k))] for k in range(bounces + 1)]
+        choices = [float(draw(key, np.uint64(path), np.uint64(k))) for k in range(bounces + 1)]
     hit, worth, throughput = on_query(scene, query), np.zeros(3), np.ones(3)
     for k in range(bounces + 1):
         if lamps(scene):
-            worth = worth + throughput * ask_a_lamp(scene, query.level[0], hit, *u[k][2:])
+            worth = worth + throughput * ask_a_lamp(scene, query.level[0], hit, *u[k], choices[k])
         d = cosine_direction(hit.normal, u[k][0], u[k][1])
         start, hit = hit, first_hit(scene, query.level[0], hit.x, d, on=hit)
         if hit is None:
@@ -454,5 +456,22 @@ def solve(scene, queries, paths, bounces, seed):
             continue
         light = np.array([math.pi * path_worth(scene, query, path, bounces, seed) for path in paths])
         mean[i], count[i] = light.mean(axis=0), len(paths)
-        m2[i] = ((light - mean[i]) ** 2).sum(axis=0)
+        m2[i] = spread(light, paths)
     return mean, m2, count
+
+
+def spread(light, paths):
+    """The m2 (3,) of the light (n, 3) of paths, from couples that share a box of their net.
+
+    Cut the paths into nets, the largest first from the front; path i of a net of that size has the mate
+    i ^ partner(size). Paths that are nets by themselves are two at most: one more couple.
+    """
+    couples, alone, at = [], [], paths.start
+    while at < paths.stop:
+        size = net_size(at, paths.stop - at)
+        couples += [(at + i, at + (i ^ partner(size))) for i in range(size) if i < i ^ partner(size)]
+        alone += [at] if size == 1 else []
+        at += size
+    couples += [tuple(alone)] if len(alone) == 2 else []
+    total = sum((((light[i - paths.start] - light[j - paths.start]) ** 2) for i, j in couples), np.zeros(3))
+    return total * (len(paths) - 1) / max(2 * len(couples), 1)

@@ -100,7 +100,9 @@ class Samples:
     mean : (n, 3) float32
         Irradiance, linear RGB, never clamped: π times the mean worth of a cosine-distributed path.
     m2 : (n, 3) float32
-        Sum over the paths of squared deviations from the mean.
+        Spread of the mean, as paths (paths - 1) stderr²: for independent paths the sum of squared deviations; here from
+        couples of paths that share a box of their net, so that it measures noise and not the change of light over the
+        hemisphere.
     paths : (n,) int32
         Number of paths; 0 marks a hole, whose mean and m2 are 0.
     """

@@ -11,16 +11,15 @@ import numba
 import numpy as np
 from numba.extending import register_jitable
 
-from illumgrid.rng import draw, mix, stream
+from illumgrid.rng import draw, draw_pair, mix, net_size, partner, pascal, reverse, stream, upward
 
-for _function in (mix, stream, draw):
+for _function in (mix, stream, draw, reverse, pascal, upward, draw_pair, net_size, partner):
     register_jitable(_function)
 
 # No fastmath: a miss is t = inf, and the sign of a coefficient near zero decides the side.
 jit = numba.njit(cache=True, nogil=True, error_model="numpy")
 
-MISS, SURFACE, CAP, BURIED, QUAD = 0, 1, 2, 3, 4  # what a ray meets: nothing, a level set, a cap, a solid's inside, a quad
-DIMENSIONS = 8  # random numbers set aside for a segment of a path: 0, 1 its direction; 2, 3, 4 a point on a lamp
+MISS, SURFACE, CAP, BURIED, QUAD = 0, 1, 2, 3, 4  # a ray meets nothing, a level set, a cap, a solid's inside, a quad
 BRICK_SHIFT = 2  # bricks of 4 cells a side, as in levelset.BRICK
 ON_A_VOXEL = 1e-7  # as in illumgrid.volume
 ON_A_WALL = 1e-10  # a wall reaches this share of its size farther, so that walls joined at an edge leave no gap
@@ -357,7 +356,7 @@ def gradient_normal(scene, f, ux, uy, uz):
 
 @jit
 def hit_normal(scene, number, what, face, x, d):
-    """Normal where a ray met a surface: the gradient normal, that of the cap's face, or the side of the quad it came to."""
+    """Normal where a ray met a surface: the gradient normal, that of the cap, or the side of the quad it came to."""
     if what == CAP:
         return (
             -np.copysign(1.0, d[0]) if face == 0 else 0.0,
@@ -441,14 +440,11 @@ def lamp_density(scene, q, distance, d):
 
 
 @jit
-def light_from_lamps(scene, key, path, segment, level, on, on_cap, x, n):
+def light_from_lamps(scene, choice, u, v, level, on, on_cap, x, n):
     """Share of a lamp's emission that arrives at x from one point of one lamp, and the lamp: (weight, quad).
 
     The weight is that of the balance heuristic: cosine density over the sum of both densities (Veach & Guibas 1995).
     """
-    dimension = np.uint64(DIMENSIONS * segment)
-    choice = draw(key, path, dimension + np.uint64(4))
-    u, v = draw(key, path, dimension + np.uint64(2)), draw(key, path, dimension + np.uint64(3))
     q, target = lamp_point(scene, choice, u, v)
     wx, wy, wz = target[0] - x[0], target[1] - x[1], target[2] - x[2]
     distance = np.sqrt(wx * wx + wy * wy + wz * wz)
@@ -474,16 +470,17 @@ def walk(scene, key, path, bounces, level, own, x, n):
     keep_red, keep_green, keep_blue = 1.0, 1.0, 1.0  # throughput: share of the light that comes back along the path
     on, on_cap, fields = own, False, scene.start.shape[0]
     for segment in range(bounces + 1):
-        # Ask a lamp for its light, weighted against the chance that the ray below finds it.
+        # Ask a lamp for its light, weighted against the chance that the ray below finds it. One pair of numbers serves
+        # both: each keeps its mean, and their shared boxes keep the error bars short.
+        u1, u2 = draw_pair(key, path, np.uint64(segment))
         if scene.lamps.shape[0] > 0:
-            weight, q = light_from_lamps(scene, key, path, segment, level, on, on_cap, x, n)
+            choice = draw(key, path, np.uint64(segment))
+            weight, q = light_from_lamps(scene, choice, u1, u2, level, on, on_cap, x, n)
             red += keep_red * weight * scene.emission[fields + q, 0]
             green += keep_green * weight * scene.emission[fields + q, 1]
             blue += keep_blue * weight * scene.emission[fields + q, 2]
 
         # Choose a direction by the cosine about the normal.
-        u1 = draw(key, path, np.uint64(DIMENSIONS * segment))
-        u2 = draw(key, path, np.uint64(DIMENSIONS * segment + 1))
         d = cosine_direction(u1, u2, n[0], n[1], n[2])
 
         # Follow the ray to the nearest surface; one that dips under its own has hit it already.
@@ -524,6 +521,41 @@ def walk(scene, key, path, bounces, level, own, x, n):
 
 
 @jit
+def mean_worth(scene, key, first, count, bounces, level, own, x, n):
+    """Mean worth of paths number first .. first + count - 1 of one query, and their m2: six numbers.
+
+    Collapsed strata: the range is cut into nets; within a net two paths that share a box differ by noise alone, however
+    the light changes from box to box. m2 = (count - 1) Σ (one - other)² / (paths in couples), so that
+    stderr² = m2 / (count (count - 1)). Paths without a mate are two at most, first and last: they are a couple.
+    """
+    sum_r, sum_g, sum_b, off_r, off_g, off_b = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    at, left, coupled = first, count, 0
+    lone, lone_r, lone_g, lone_b = False, 0.0, 0.0, 0.0
+    while left > 0:
+        size = net_size(at, left)
+        mate = partner(size)
+        for i in range(max(size // 2, 1)):
+            red, green, blue = walk(scene, key, np.uint64(at + i), bounces, level, own, x, n)
+            sum_r, sum_g, sum_b = sum_r + red, sum_g + green, sum_b + blue
+            if size == 1 and not lone:
+                lone, lone_r, lone_g, lone_b = True, red, green, blue
+                continue
+            if size == 1:
+                other_r, other_g, other_b = lone_r, lone_g, lone_b
+            else:
+                other_r, other_g, other_b = walk(scene, key, np.uint64(at + (i ^ mate)), bounces, level, own, x, n)
+                sum_r, sum_g, sum_b = sum_r + other_r, sum_g + other_g, sum_b + other_b
+            off_r += (red - other_r) ** 2
+            off_g += (green - other_g) ** 2
+            off_b += (blue - other_b) ** 2
+            coupled += 2
+        at += size
+        left -= size
+    share = (count - 1) / max(coupled, 1)
+    return sum_r / count, sum_g / count, sum_b / count, off_r * share, off_g * share, off_b * share
+
+
+@jit
 def solve_queries(scene, ids, point, normal, level, target, first, count, bounces, seed, mean, m2, paths):
     """Irradiance at queries in frame coordinates, from `count` paths from number `first` on; fills mean, m2, paths."""
     for i in range(ids.shape[0]):
@@ -531,17 +563,9 @@ def solve_queries(scene, ids, point, normal, level, target, first, count, bounce
         if (n[0] == 0.0 and n[1] == 0.0 and n[2] == 0.0) or buried(scene, level[i], x, target[i]):
             continue
         key = stream(seed, ids[i])
-        mean_r, mean_g, mean_b, m2_r, m2_g, m2_b = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-        for k in range(count):
-            red, green, blue = walk(scene, key, np.uint64(first + k), bounces, level[i], target[i], x, n)
-            # Welford's update: the spread without cancellation.
-            off_r, off_g, off_b = np.pi * red - mean_r, np.pi * green - mean_g, np.pi * blue - mean_b
-            mean_r, mean_g, mean_b = mean_r + off_r / (k + 1), mean_g + off_g / (k + 1), mean_b + off_b / (k + 1)
-            m2_r += off_r * (np.pi * red - mean_r)
-            m2_g += off_g * (np.pi * green - mean_g)
-            m2_b += off_b * (np.pi * blue - mean_b)
-        mean[i, 0], mean[i, 1], mean[i, 2] = mean_r, mean_g, mean_b
-        m2[i, 0], m2[i, 1], m2[i, 2] = m2_r, m2_g, m2_b
+        r, g, b, off_r, off_g, off_b = mean_worth(scene, key, first, count, bounces, level[i], target[i], x, n)
+        mean[i, 0], mean[i, 1], mean[i, 2] = np.pi * r, np.pi * g, np.pi * b
+        m2[i, 0], m2[i, 1], m2[i, 2] = np.pi**2 * off_r, np.pi**2 * off_g, np.pi**2 * off_b
         paths[i] = count
 
 

@@ -3,6 +3,7 @@
 The path loop has the headings of `kernels.walk`; everything that Numba's kernels do for speed is left out.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import ClassVar, Literal
@@ -11,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from illumgrid.levelset import Marchable, in_frame, marchable
-from illumgrid.rng import draw, stream
+from illumgrid.rng import draw, draw_pair, net_size, partner, stream
 from illumgrid.samples import Queries, Samples, check_request
 from illumgrid.scene import Scene
 from illumgrid.volume import ON_A_VOXEL, Floats
@@ -20,7 +21,6 @@ Bools = NDArray[np.bool_]
 Ints = NDArray[np.int64]
 
 MISS, SURFACE, CAP, BURIED, QUAD = 0, 1, 2, 3, 4
-DIMENSIONS = 8  # random numbers set aside for a segment: 0, 1 its direction; 2, 3, 4 a point on a lamp
 ON_A_WALL = 1e-10  # a wall reaches this share of its size farther, so that walls joined at an edge leave no gap
 _CORNERS = np.array(list(np.ndindex(2, 2, 2)))
 
@@ -164,7 +164,7 @@ def meet_quad(scene: Marchable, q: int, x: Floats, d: Floats) -> Floats:
 def nearest_hit(
     scene: Marchable, level: Floats, x: Floats, d: Floats, on: Ints, on_cap: Bools
 ) -> tuple[Floats, Ints, Ints, Ints]:
-    """First surface along the frame rays x + t d: (t, number, what, axis of a cap), each (n,); fields first, then quads."""
+    """First surface along frame rays: (t, number, what, axis of a cap), each (n,); fields are numbered first, then quads."""
     n, fields = len(x), len(scene.start)
     best, number, what, face = np.full(n, np.inf), np.full(n, -1), np.full(n, MISS), np.full(n, -1)
     for q in range(len(scene.quad_corner)):
@@ -265,16 +265,17 @@ def walk(
     x, normal, on, on_cap = x.copy(), normal.copy(), own.astype(np.int64), np.zeros(len(x), bool)
     alive, fields = np.arange(len(x)), len(scene.start)
     for segment in range(bounces + 1):
-        u = [draw(key[alive], np.uint64(path), np.uint64(DIMENSIONS * segment + k)) for k in range(5)]
-
-        # Ask a lamp for its light, weighted against the chance that the ray below finds it.
+        # Ask a lamp for its light, weighted against the chance that the ray below finds it. One pair of numbers serves
+        # both: each keeps its mean, and their shared boxes keep the error bars short.
+        u1, u2 = draw_pair(key[alive], np.uint64(path), np.uint64(segment))
         if len(scene.lamps):
+            u = np.stack([u1, u2, draw(key[alive], np.uint64(path), np.uint64(segment))], axis=1)
             at = (level[alive], on[alive], on_cap[alive], x[alive], normal[alive])
-            weight, number = light_from_lamps(scene, np.stack(u[2:], axis=1), *at)
+            weight, number = light_from_lamps(scene, u, *at)
             worth[alive] += keep[alive] * weight[:, None] * scene.emission[number]
 
         # Choose a direction by the cosine about the normal.
-        d = cosine_direction(u[0], u[1], normal[alive])
+        d = cosine_direction(u1, u2, normal[alive])
 
         # Follow the ray to the nearest surface; one that dips under its own has hit it already.
         t, number, what, face = nearest_hit(scene, level[alive], x[alive], d, on[alive], on_cap[alive])
@@ -322,6 +323,20 @@ def holes(scene: Marchable, level: Floats, x: Floats, normal: Floats, target: In
     return bad
 
 
+def couples(paths: range) -> Iterator[tuple[int, int | None]]:
+    """Paths by twos that share a box of their net; two that are left, first and last, too; one alone is (path, None)."""
+    alone = []
+    at = paths.start
+    while at < paths.stop:
+        size = net_size(at, paths.stop - at)
+        if size == 1:
+            alone.append(at)
+        yield from ((at + i, at + (i ^ partner(size))) for i in range(size // 2))
+        at += size
+    if alone:
+        yield alone[0], alone[1] if len(alone) == 2 else None
+
+
 @dataclass(frozen=True)
 class Reference:
     """The same paths as `numba`, in pure NumPy: slow, and easy to check."""
@@ -336,13 +351,18 @@ class Reference:
         point, normal, level = in_frame(scene, queries)
         mean, m2 = np.zeros((len(queries), 3)), np.zeros((len(queries), 3))
         good = ~holes(fields, level, point, normal, queries.target.astype(np.int64))
+        own, row, x, n = queries.target[good].astype(np.int64), level[good], point[good], normal[good]
         with np.errstate(over="ignore"):  # the random numbers wrap around, on purpose
             key = stream(np.uint64(seed), queries.id[good])
-            for n, path in enumerate(paths):
-                own = queries.target[good].astype(np.int64)
-                worth = walk(fields, key, path, bounces, level[good], own, point[good], normal[good])
-                off = np.pi * worth - mean[good]
-                mean[good] += off / (n + 1)
-                m2[good] += off * (np.pi * worth - mean[good])
+            paired = 0
+            for one, other in couples(paths):
+                worth = walk(fields, key, one, bounces, row, own, x, n)
+                mean[good] += np.pi * worth / len(paths)
+                if other is not None:
+                    second = walk(fields, key, other, bounces, row, own, x, n)
+                    m2[good] += (np.pi * (worth - second)) ** 2
+                    mean[good] += np.pi * second / len(paths)
+                    paired += 2
         count = np.where(good, len(paths), 0).astype(np.int32)
+        m2 *= (len(paths) - 1) / max(paired, 1)
         return Samples(queries, mean.astype(np.float32), m2.astype(np.float32), count)
