@@ -229,8 +229,8 @@ def meet_other(solid, x, d):
     found = march(solid, u, du, max(t_in, 0.0), t_out)
     if found is None:
         return None
-    if found[0] <= 0 and t_in < 0:
-        return Hit(0.0, solid.number, x, None)  # starts inside
+    if found[0] <= 0 and t_in <= 0:
+        return Hit(0.0, solid.number, x, None)  # starts inside, or on the border
     if found[0] == t_in:
         normal = [0.0, 0.0, 0.0]
         normal[axis] = -math.copysign(1.0, d[axis])

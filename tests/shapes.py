@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from illumgrid.errors import BadInput
-from illumgrid.grid import GridSpec, IlluminationGrid
+from illumgrid.grid import GridSpec, IlluminationGrid, WallTexture
 from illumgrid.illumination import Illumination
 from illumgrid.scene import Scene, level_table
 from illumgrid.volume import Volume
@@ -58,4 +58,8 @@ def lit(scene, value=1.0, nodes=4):
         spec = GridSpec.over(field.volume, nodes)
         values = np.full((*spec.shape, 3), value, np.float32)
         grids.append(IlluminationGrid(spec, values, np.zeros(spec.shape), np.ones(spec.shape)))
-    return Illumination(scene, level_table(scene, 2), tuple(grids), {"seed": 0})
+    walls = [
+        WallTexture(np.full((2, *q.texels[::-1], 3), value, np.float32), np.ones((2, *q.texels[::-1])))
+        for q in scene.quads
+    ]
+    return Illumination(scene, level_table(scene, 2), tuple(grids), tuple(walls), {"seed": 0})

@@ -7,47 +7,11 @@ import pytest
 from PIL import Image
 
 import illumgrid as ig
-from illumgrid import cli, preview
+from illumgrid import cli
 from shapes import MIRRORED, ball, sampled
 
 QUICK = ("--grid", "8", "--paths", "2", "--bounces", "1")
 RANGE = ("--range", "0.3", "0.9")
-
-
-@pytest.fixture(autouse=True)
-def small_pictures(monkeypatch):
-    monkeypatch.setattr(preview.render, "__kwdefaults__", {"width": 64, "height": 48, "local": False})
-
-
-@pytest.fixture
-def call(capsys, tmp_path, monkeypatch):
-    """Run a command in a folder of its own; returns what it said."""
-    monkeypatch.chdir(tmp_path)
-    np.save(tmp_path / "v.npy", ball(10).values)
-
-    def call(*args, code=0):
-        result = cli.guarded(lambda: cli.app([str(a) for a in args], standalone_mode=False))
-        said = "".join(capsys.readouterr())
-        assert result == code, said
-        assert "Traceback" not in said
-        return said
-
-    return call
-
-
-@pytest.fixture
-def refuse(call, tmp_path):
-    """A command is refused in one sentence with these words, and nothing is written."""
-
-    def refuse(*args, words):
-        before = sorted(tmp_path.rglob("*"))
-        said = call(*args, code=2).strip()
-        assert said.count("\n") == 0 and said.startswith("illumgrid: ") and ". " not in said, said
-        for word in words:
-            assert word in said, said
-        assert sorted(tmp_path.rglob("*")) == before
-
-    return refuse
 
 
 def shown(path):
@@ -168,6 +132,8 @@ def test_what_was_noted_during_a_run_is_kept_and_shown_again(call, tmp_path):
 @pytest.mark.parametrize(
     "args, words",
     [
+        (("v.npy", "--scene", "cave"), ["--scene", "'cave'", "sky, floor or box"]),
+        (("nucleus", "--scene", "sky"), ["--scene", "nucleus", "leave them out"]),
         (("nowhere.nrrd",), ["nowhere.nrrd", "no such file"]),
         (("v.npy", "--range", "5", "1"), ["range", "5.0, 1.0", "isovalue"]),
         (("v.npy", "--range", "7", "9"), ["misses its data"]),
@@ -279,7 +245,7 @@ def test_the_version_and_the_help_are_told(call):
     assert call("--version").strip() == f"illumgrid {ig.__version__}"
     said = call("run", "--help")
     stages = "--sampler --isovalues --range --inside --backend --paths --bounces --seed --grid --interpolator"
-    for option in f"{stages} --albedo --set --smooth --threads --no-preview --overwrite --output".split():
+    for option in f"{stages} --scene --albedo --set --smooth --threads --no-preview --overwrite --output".split():
         assert option in said
     assert "--isovalue" in call("preview", "--help") and "VOLUME" in call("info", "--help")
     everything = call("--help")

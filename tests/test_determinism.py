@@ -15,6 +15,7 @@ from illumgrid.samplers import direct
 from illumgrid.samplers.direct import Direct
 from illumgrid.samplers.uniform import Uniform
 from illumgrid.samples import join_queries
+from illumgrid.scene import level_table
 from illumgrid.stages import on_level_sets
 from transport import colored, everywhere, furnace, noise, waves
 
@@ -31,7 +32,8 @@ def specs_of(scene, nodes=11):
 
 def light(scene, sampler, seed=0, threads=0, **how):
     stages = sampler, Numba(threads=threads), Nearest()
-    return bake(scene, specs_of(scene), *stages, paths=range(6), bounces=3, seed=seed, **how).grids
+    levels = level_table(scene, 2)
+    return bake(scene, specs_of(scene), levels, *stages, paths=range(6), bounces=3, seed=seed, **how).grids
 
 
 def equal(one, other):

@@ -14,7 +14,7 @@ from illumgrid.grid import GridSpec
 from illumgrid.interpolators.nearest import Nearest
 from illumgrid.samplers.direct import Direct
 from illumgrid.samples import Queries
-from illumgrid.scene import Field, Scene
+from illumgrid.scene import Field, Scene, level_table
 from illumgrid.volume import Volume, outward_normals, smooth_gradient
 from transport import assert_standard_normal, colored, furnace, noise, on_sets, on_voxels, rotation, voxels, waves
 
@@ -41,7 +41,8 @@ def direct_grid(volume, limits, inside="above", seed=0):
     scene = Scene.sky(volume, (0.5, 0.5, 0.5), limits, inside)
     spec = GridSpec.over(volume, max(volume.shape))
     assert spec.shape == volume.shape
-    light = bake(scene, [spec], Direct(), Numba(), Nearest(), paths=range(PATHS), bounces=3, seed=seed)
+    stages = Direct(), Numba(), Nearest()
+    light = bake(scene, [spec], level_table(scene, 2), *stages, paths=range(PATHS), bounces=3, seed=seed)
     return light.grids[0]
 
 

@@ -148,7 +148,7 @@ def test_a_hole_takes_the_value_of_the_nearest_supported_node_in_the_world():
     random = np.random.default_rng(0)
     values = random.random((6, 5, 4, 3)).astype(np.float32)
     support = (random.random((6, 5, 4)) < 0.2).astype(np.float32)
-    filled = fill_holes(spec, values, support).reshape(-1, 3)
+    filled = fill_holes(spec.spacing, values, support).reshape(-1, 3)
     nodes, good = spec.nodes(), support.ravel() > 0
     apart = np.linalg.norm(nodes[:, None] - nodes[good][None], axis=2)
     for node in range(len(nodes)):
@@ -161,4 +161,4 @@ def test_a_hole_takes_the_value_of_the_nearest_supported_node_in_the_world():
 def test_all_or_no_support_leaves_the_values(support):
     spec = GridSpec((2, 3, 4))
     values = np.random.default_rng(0).random((2, 3, 4, 3)).astype(np.float32)
-    assert np.array_equal(fill_holes(spec, values, np.full((2, 3, 4), support, np.float32)), values)
+    assert np.array_equal(fill_holes(spec.spacing, values, np.full((2, 3, 4), support, np.float32)), values)

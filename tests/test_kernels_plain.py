@@ -239,10 +239,10 @@ def test_where_a_ray_touches_a_saddle_there_is_no_normal():
 def test_a_path_that_starts_inside_another_solid_is_worth_nothing():
     scene = colored(furnace(linear((1, 0, 0)), linear((1, 0, 0), origin=(0.1, 0.1, 0.1))))
     levels = np.array([2.5, 2.5]) * upward(scene)  # the second, below, holds all from 0.1 to 2.6 along x
-    point, normal = np.array([2.5, 3.0, 2.0]), np.array([-1.0, 0, 0])
+    point, normal = (2.5, 3.0, 2.0), (-1.0, 0.0, 0.0)
     for path in range(5):
         key = np.uint64(7)
-        assert kernels.walk(marchable(scene), key, np.uint64(path), 4, levels, 0, *point, *normal) == (0, 0, 0)
+        assert kernels.walk(marchable(scene), key, np.uint64(path), 4, levels, 0, point, normal) == (0, 0, 0)
 
 
 @pytest.mark.parametrize("d", [(1, 1, 1), (-1, 1, -1), (0, 0, 1), (0, -1, 0)])

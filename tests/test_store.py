@@ -9,8 +9,8 @@ import pytest
 
 from illumgrid import store
 from illumgrid.errors import BadInput
-from illumgrid.grid import GridSpec, IlluminationGrid
-from illumgrid.scene import Field, Levels, Material, Scene
+from illumgrid.grid import GridSpec, IlluminationGrid, WallTexture
+from illumgrid.scene import Field, Levels, Material, Quad, Scene
 from illumgrid.volume import Volume
 
 MIRRORED = ((0, 0, -1), (1, 0, 0), (0, 1, 0))
@@ -24,8 +24,14 @@ def grid(spec: GridSpec, rng: np.random.Generator) -> IlluminationGrid:
     return IlluminationGrid(spec, values, error, np.isfinite(error).astype(np.float32))
 
 
+def wall(quad: Quad, rows: int, rng: np.random.Generator) -> WallTexture:
+    values = rng.random((rows, *quad.texels[::-1], 3), np.float32)
+    values.flat[: len(ODD)] = ODD
+    return WallTexture(values, (rng.random(values.shape[:3]) < 0.7).astype(np.float32))
+
+
 def example(count: int = 1, seed: int = 0, direction=MIRRORED) -> store.Stored:
-    """One field, or two that differ in all that can differ, on lattices with no two sides alike."""
+    """One field, or two that differ in all that can differ, between walls, on lattices with no two sides alike."""
     rng = np.random.default_rng(seed)
     first = Volume(rng.normal(size=(4, 7, 5)), (1 / 3, -1e5, 2e-7), (0.1, 1 / 7, 3), direction)
     second = Volume(rng.normal(size=(3, 2, 6)) * 1e20, (0.1, 0.2, 0.3), (1, 2, 3), direction)
@@ -33,7 +39,11 @@ def example(count: int = 1, seed: int = 0, direction=MIRRORED) -> store.Stored:
         Field("protons", first, Material((0.1, 0.2, 1 / 3)), (-0.1, 0.7), "below"),
         Field("Dichte/ρ 名", second, Material((1, 0, 0.5), (0, 1e-300, 7e9)), (-1e19, 2e19), "above"),
     )[:count]
-    scene = Scene(fields, background=(0.1, 0, 1 / 3))
+    quads = (
+        Quad("wall/名", (1 / 3, -1e5, 2e-7), (0.1, 0, 1 / 7), (0, 1e-9, 3e-9), Material((1 / 3, 0, 1)), (3, 2)),
+        Quad("lamp", (1, 2, 3), (0, 0, -1), (0, 7, 0), Material((0, 0, 0), (0, 1e-300, 7e9)), (1, 5)),
+    )[: 2 * (count - 1)]
+    scene = Scene(fields, quads, background=(0.1, 0, 1 / 3))
     grids = tuple(grid(GridSpec.over(f.volume, n), rng) for f, n in zip(fields, (9, 5)))
     recipe = {
         "seed": 2**70 + seed,
@@ -42,7 +52,8 @@ def example(count: int = 1, seed: int = 0, direction=MIRRORED) -> store.Stored:
         "path": "é\udcff",
         "list": [1.5, True, "x"],
     }
-    return store.Stored(scene, Levels(scene.levels(np.linspace(0, 1, 4))), grids, recipe)
+    walls = tuple(wall(q, 4, rng) for q in quads)
+    return store.Stored(scene, Levels(scene.levels(np.linspace(0, 1, 4))), grids, walls, recipe)
 
 
 def assert_same(one: store.Stored, other: store.Stored) -> None:
@@ -57,6 +68,10 @@ def assert_same(one: store.Stored, other: store.Stored) -> None:
         for g in stored.grids:
             rest += [g.spec.shape, *(a.tobytes() for a in (g.spec.origin, g.spec.spacing, g.spec.direction))]
             rest += [a.tobytes() for a in (g.values, g.error, g.support)]
+        for q, w in zip(stored.scene.quads, stored.walls, strict=True):
+            m = q.material
+            rest += [q.name, q.texels, w.values.shape, w.support.shape, w.values.dtype, w.support.dtype]
+            rest += [a.tobytes() for a in (q.corner, q.edge_u, q.edge_v, m.albedo, m.emission, w.values, w.support)]
         table = stored.levels.table
         return [*rest, stored.scene.background.tobytes(), table.shape, table.tobytes(), stored.recipe]
 
@@ -102,7 +117,14 @@ def test_other_programs_find_the_documented_layout(tmp_path):
     stored = example(2)
     store.write(tmp_path / "out", stored, None, False)
     parts = {p.name(): p for p in OpenEXR.File(str(tmp_path / "out" / store.EXR), separate_channels=True).parts}
-    assert list(parts) == ["light/protons", "field/protons", "light/Dichte/ρ 名", "field/Dichte/ρ 名"]
+    assert list(parts) == [
+        "light/protons",
+        "field/protons",
+        "light/Dichte/ρ 名",
+        "field/Dichte/ρ 名",
+        "wall/wall/名",
+        "wall/lamp",
+    ]
     field, light = parts["field/protons"], parts["light/protons"]
     assert (field.width(), field.height(), set(field.channels)) == (4, 7 * 5, {"Y"})
     assert set(light.channels) == {"R", "G", "B", "error", "support"}
@@ -114,6 +136,12 @@ def test_other_programs_find_the_documented_layout(tmp_path):
     row, column = z * own.spec.shape[1] + y, x
     found = [light.channels[c].pixels[row, column] for c in ("R", "G", "B", "error", "support")]
     assert found == [*own.values[x, y, z], own.error[x, y, z], own.support[x, y, z]]
+    texels = parts["wall/wall/名"]
+    assert set(texels.channels) == {"R", "G", "B", "support"}
+    assert texels.header["layout"] == "array (nx, ny, nz) = (3, 2, 4); row = z*ny + y, column = x"
+    u, v, k = 2, 1, 3
+    found = [texels.channels[c].pixels[k * 2 + v, u] for c in ("R", "G", "B", "support")]
+    assert found == [*stored.walls[0].values[k, v, u], stored.walls[0].support[k, v, u]]
     assert {c.pixels.dtype for p in parts.values() for c in p.channels.values()} == {np.dtype(np.float32)}
 
 
@@ -131,23 +159,25 @@ def test_without_a_picture_there_is_none_and_others_may_read(tmp_path):
 def test_what_does_not_belong_together_is_refused():
     one, two = example(1), example(2)
     with pytest.raises(BadInput, match="1 grids came for 2 fields"):
-        store.Stored(two.scene, two.levels, one.grids, {})
+        store.Stored(two.scene, two.levels, one.grids, two.walls, {})
     with pytest.raises(BadInput, match=r"shape \(4, 1\)"):
-        store.Stored(two.scene, one.levels, two.grids, {})
+        store.Stored(two.scene, one.levels, two.grids, two.walls, {})
+    with pytest.raises(BadInput, match="0 wall textures came for 2 quads"):
+        store.Stored(two.scene, two.levels, two.grids, (), {})
 
 
 @pytest.mark.parametrize("recipe", [{"x": float("nan")}, {"x": object()}])
 def test_a_recipe_that_json_lacks_is_refused(tmp_path, recipe):
     stored = example()
     with pytest.raises((TypeError, ValueError), match="JSON"):
-        store.write(tmp_path / "out", store.Stored(stored.scene, stored.levels, stored.grids, recipe), None, False)
+        store.write(tmp_path / "out", store.Stored(stored.scene, stored.levels, stored.grids, (), recipe), None, False)
     assert not list(tmp_path.iterdir())
 
 
 def test_keys_that_are_numbers_become_text_and_do_not_break_the_checksum(tmp_path):
     stored = example()
     recipe = {10: "a", 9: ("b", "c")}
-    store.write(tmp_path / "out", store.Stored(stored.scene, stored.levels, stored.grids, recipe), None, False)
+    store.write(tmp_path / "out", store.Stored(stored.scene, stored.levels, stored.grids, (), recipe), None, False)
     assert store.read(tmp_path / "out").recipe == {"10": "a", "9": ["b", "c"]}
 
 

@@ -43,7 +43,7 @@ def test_what_no_screen_can_show_is_clamped():
 def test_exposure_brings_the_brightest_surfaces_to_white():
     radiance = np.random.default_rng(0).random((10000, 3))
     exposure = automatic_exposure(radiance)
-    assert np.quantile(radiance.max(axis=1) * exposure, 0.98) == pytest.approx(WHITE)
+    assert np.quantile(radiance.max(axis=1) * exposure, 0.9) == pytest.approx(WHITE)
     assert automatic_exposure(radiance * 1e-6) == pytest.approx(exposure * 1e6)
 
 

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from illumgrid.grid import GridSpec, IlluminationGrid, WallTexture
     from illumgrid.illumination import Illumination, load, run
     from illumgrid.levelset import isosurface
-    from illumgrid.readers import read_volume
+    from illumgrid.readers import read_scene, read_volume
     from illumgrid.registry import backend, interpolator, sampler
     from illumgrid.samples import Queries, Samples
     from illumgrid.scene import Field, Levels, Material, Quad, Scene, suggest_range
@@ -38,6 +38,7 @@ __all__ = [
     "interpolator",
     "isosurface",
     "load",
+    "read_scene",
     "read_volume",
     "run",
     "sampler",
@@ -49,7 +50,7 @@ _HOMES = {
     "grid": ("GridSpec", "IlluminationGrid", "WallTexture"),
     "illumination": ("Illumination", "load", "run"),
     "levelset": ("isosurface",),
-    "readers": ("read_volume",),
+    "readers": ("read_scene", "read_volume"),
     "registry": ("backend", "interpolator", "sampler"),
     "samples": ("Queries", "Samples"),
     "scene": ("Field", "Levels", "Material", "Quad", "Scene", "suggest_range"),

@@ -103,24 +103,25 @@ def holes_within_range(scene: Scene, field: int, grid: IlluminationGrid) -> int:
 def light_left_out(scene: Scene, backend: Backend, bounces: int, seed: int = 0) -> float:
     """Share of all light that more than `bounces` reflections would add, from a few paths on a coarse grid.
 
-    The paths with more bounces begin as those with fewer, so that the difference is the light of the rest and not noise.
+    The paths with more bounces begin as those with fewer, so that the difference is light and not noise.
     """
     specs = [GridSpec.over(field.volume, 10) for field in scene.fields]
     asked = join_queries([q for q in Direct().queries(scene, specs, seed) if len(q)])
-    asked = asked[:: max(1, len(asked) // 200)]
+    asked = asked[:: max(1, len(asked) // 128)]
     mean = [
-        float(backend.solve(scene, asked, paths=range(32), bounces=b, seed=seed).mean.mean())
-        for b in (bounces, 3 * bounces + 30)
+        float(backend.solve(scene, asked, paths=range(16), bounces=b, seed=seed).mean.mean())
+        for b in (bounces, 3 * bounces + 20)
     ]
     return 1.0 - mean[0] / mean[1] if mean[1] > 0 else 0.0
 
 
-def enough_bounces(scene: Scene, backend: Backend, seed: int = 0) -> int:
-    """Reflections to follow: 4 under an open sky, in a closed scene until less than 1 % of the light is left out."""
-    bounces = 4
-    while not scene.background.any() and bounces < 128 and light_left_out(scene, backend, bounces, seed) >= 0.01:
+def enough_bounces(scene: Scene, backend: Backend, seed: int = 0) -> tuple[int, float]:
+    """Reflections to follow, and the share of light left out: 4 under a sky, in a closed scene until below 1 %."""
+    bounces, left_out = 4, light_left_out(scene, backend, 4, seed)
+    while not scene.background.any() and bounces < 128 and left_out >= 0.01:
         bounces += max(1, bounces // 4)
-    return bounces
+        left_out = light_left_out(scene, backend, bounces, seed)
+    return bounces, left_out
 
 
 def bake(

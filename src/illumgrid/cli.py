@@ -4,11 +4,12 @@ import math
 import sys
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -16,9 +17,11 @@ from illumgrid.errors import BadInput, IllumgridWarning
 
 if TYPE_CHECKING:
     from illumgrid.bake import Progress
+    from illumgrid.demo import Preset
+    from illumgrid.grid import WallTexture
     from illumgrid.illumination import Illumination
-    from illumgrid.scene import Scene
-    from illumgrid.volume import Volume
+    from illumgrid.scene import Quad, Scene
+    from illumgrid.volume import Side, Volume
 
 app = typer.Typer(
     help="Global illumination for every isosurface of a volume at once.",
@@ -93,26 +96,63 @@ def _given(**options: Any) -> str:
     return ", ".join(f"--{name}" for name, value in options.items() if value is not None)
 
 
-def _volume_scene(
-    source: str,
-    smooth: float,
+@dataclass(frozen=True)
+class Input:
+    """What is to be lit: a name for the folder of the result, and how the scene is made, blurred by `smooth` voxels."""
+
+    name: str
+    make: Callable[[float], "Scene"]
+    preset: "Preset | None" = None
+
+
+def _input(
+    source: str | None,
+    surroundings: str | None,
     limits: tuple[float, float] | None,
-    inside: Literal["above", "below"],
-    albedo: tuple[float, float, float],
-) -> "Scene":
+    inside: str | None,
+    albedo: tuple[float, float, float] | None,
+) -> Input:
+    """Tell a volume file from a scene file and a built-in scene; nothing is read yet."""
+    from illumgrid.demo import SCENES
+    from illumgrid.readers import volume_name
+
+    name = source or "nucleus"
+    preset = SCENES.get(name) if source is None or not Path(source).exists() else None
+    if preset or name.lower().endswith(".toml"):
+        if extra := _given(scene=surroundings, range=limits, inside=inside, albedo=albedo):
+            what, todo = ("built-in scene", "leave") if preset else ("scene file", "write them into the file and leave")
+            raise BadInput(f"{extra} came with the {what} {name!r}; expected a volume file with them: {todo} them out")
+        return Input(name, partial(_smoothed, preset.make), preset) if preset else _scene_file(name)
+    if inside not in (None, "above", "below"):
+        raise BadInput(f"--inside is {inside!r}; expected above or below")
+    if surroundings not in (None, "sky", "floor", "box"):
+        raise BadInput(f"--scene is {surroundings!r}; expected sky, floor or box")
+    side: Side = "below" if inside == "below" else "above"
+    make = partial(_volume_scene, name, surroundings or "sky", albedo or (0.8, 0.8, 0.8), limits, side)
+    return Input(volume_name(name), make)
+
+
+def _scene_file(name: str) -> Input:
+    from illumgrid.readers import read_scene
+
+    return Input(Path(name).stem, lambda smooth: read_scene(name, smoothing=smooth))
+
+
+def _volume_scene(source: str, surroundings: str, albedo: Any, limits: Any, inside: "Side", smooth: float) -> "Scene":
     from illumgrid.readers import read_volume, volume_name
     from illumgrid.scene import Scene
     from illumgrid.volume import finite
     from illumgrid.volume import smooth as blur
 
-    volume = blur(finite(read_volume(source), inside), smooth)
-    return Scene.sky(volume, albedo, limits, inside, volume_name(source))
+    around = {"sky": Scene.sky, "floor": Scene.floor, "box": Scene.box}[surroundings]
+    return around(blur(finite(read_volume(source), inside), smooth), albedo, limits, inside, volume_name(source))
 
 
-def _smoothed(scene: "Scene", sigma: float) -> "Scene":
+def _smoothed(make: Callable[[], "Scene"], smooth: float) -> "Scene":
     from illumgrid.volume import smooth as blur
 
-    return replace(scene, fields=tuple(replace(f, volume=blur(f.volume, sigma)) for f in scene.fields))
+    scene = make()
+    return replace(scene, fields=tuple(replace(f, volume=blur(f.volume, smooth)) for f in scene.fields))
 
 
 def _stage_options(settings: list[str]) -> dict[str, dict[str, str]]:
@@ -130,15 +170,14 @@ def _stage_options(settings: list[str]) -> dict[str, dict[str, str]]:
     return options
 
 
-def _default_folder(name: str) -> Path:
-    return Path(f"{name}-light")
-
-
 @app.command()
 def run(
     source: Annotated[
         str | None,
-        typer.Argument(metavar="[INPUT]", help="A volume file or DICOM folder, or a built-in scene: nucleus."),
+        typer.Argument(
+            metavar="[INPUT]",
+            help="A volume file, DICOM folder, scene file (.toml) or built-in scene: nucleus. [default: nucleus]",
+        ),
     ] = None,
     output: Annotated[
         Path | None, typer.Option("--output", "-o", metavar="DIR", help="Where the result goes. [default: INPUT-light]")
@@ -158,12 +197,23 @@ def run(
     paths: Annotated[
         int | None, typer.Option(min=1, metavar="N", help="Light paths from every query. [default: 64]")
     ] = None,
-    bounces: Annotated[int, typer.Option(min=0, metavar="N", help="Reflections of a path.")] = 4,
+    bounces: Annotated[
+        int | None,
+        typer.Option(
+            min=0,
+            metavar="N",
+            help="Reflections. [default: 4 under an open sky; in a closed scene until under 1 % is left out]",
+        ),
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, max=2**64 - 1, metavar="N", help="Equal seeds give equal light.")] = 0,
     interpolator: Annotated[str, typer.Option(help="From samples to nodes: nearest.")] = "nearest",
     grid: Annotated[
         int | None,
         typer.Option(min=2, metavar="N", help="Nodes along the longest axis. [default: as voxels, at most 128]"),
+    ] = None,
+    surroundings: Annotated[
+        str | None,
+        typer.Option("--scene", help="What is around a volume: sky, floor (and sky), box (and lamp). [default: sky]"),
     ] = None,
     albedo: Annotated[
         tuple[float, float, float] | None,
@@ -179,13 +229,12 @@ def run(
     no_preview: Annotated[bool, typer.Option("--no-preview", help="Leave the picture out.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a finished run in DIR.")] = False,
 ) -> None:
-    """Light a volume, or a built-in scene, for all isovalues at once.
+    """Light a volume, the volumes of a scene file, or a built-in scene, for all isovalues at once.
 
     DIR then holds illumination.exr, run.json and preview.png, and needs nothing else.
     """
     begun = time.perf_counter()
     from illumgrid import registry, store
-    from illumgrid.demo import SCENES
     from illumgrid.illumination import run as light_up
 
     options = _stage_options(settings or [])
@@ -197,28 +246,14 @@ def run(
         kind: registry.make(kind, name, options[kind])
         for kind, name in (("sampler", sampler), ("backend", backend), ("interpolator", interpolator))
     }
+    given = _input(source, surroundings, limits, inside, albedo)
+    if given.preset:
+        grid, paths = grid or given.preset.grid, paths or given.preset.paths
+        isovalues = isovalues or given.preset.isovalues
+    folder = output or Path(f"{given.name}-light")
     with heard() as sentences:
-        if source is None or (source in SCENES and not Path(source).exists()):
-            name = source or "nucleus"
-            preset = SCENES[name]
-            if extra := _given(range=limits, inside=inside, albedo=albedo):
-                raise BadInput(
-                    f"{extra} came with the built-in scene {name!r}; expected a volume file with them: leave them out"
-                )
-            folder = output or _default_folder(name)
-            store.claim(folder, overwrite)
-            scene, grid, paths = _smoothed(preset.make(), smooth or 0.0), grid or preset.grid, paths or preset.paths
-        else:
-            if inside not in (None, "above", "below"):
-                raise BadInput(f"--inside is {inside!r}; expected above or below")
-            from illumgrid.readers import volume_name
-
-            name = source
-            folder = output or _default_folder(volume_name(source))
-            store.claim(folder, overwrite)
-            scene = _volume_scene(
-                source, smooth or 0.0, limits, "below" if inside == "below" else "above", albedo or (0.8, 0.8, 0.8)
-            )
+        store.claim(folder, overwrite)
+        scene = given.make(smooth or 0.0)
         for field in scene.fields:
             shape = " x ".join(map(str, field.volume.shape))
             say(f"{field.name}: {shape} voxels, isovalues {field.range[0]:.4g} to {field.range[1]:.4g}")
@@ -227,16 +262,25 @@ def run(
                 scene, **stages, grid=grid, paths=paths or 64, bounces=bounces, isovalues=isovalues, seed=seed,
                 progress=progress,
             )  # fmt: skip
-    recipe = {**light.recipe, "input": name, "smooth": smooth or 0.0, "warnings": sentences}
+    recipe = {**light.recipe, "input": source or given.name, "smooth": smooth or 0.0, "warnings": sentences}
     replace(light, recipe=recipe).save(folder, preview=not no_preview, overwrite=overwrite)
     _told_result(light, folder, time.perf_counter() - begun, picture=not no_preview)
 
 
 def _told_result(light: "Illumination", folder: Path, seconds: float, picture: bool) -> None:
-    errors = [e for e in light.recipe["relative_error"] if e is not None]
+    recipe = light.recipe
+    errors = [e for e in recipe["relative_error"] if e is not None]
     noise = f", noise about {max(errors):.1%} of the mean light" if errors else ""
-    say(f"{light.recipe['queries']} queries x {light.recipe['paths']} paths in {seconds:.1f} s{noise}")
+    say(f"{recipe['queries']} queries x {recipe['paths']} paths in {seconds:.1f} s{noise}{_told_left_out(recipe)}")
     say(f"wrote {folder}" + (f"; look at {folder / 'preview.png'}" if picture else ""))
+
+
+def _told_left_out(recipe: Mapping[str, Any]) -> str:
+    left = recipe.get("left_out")
+    if left is None:
+        return ""
+    share = f"about {left:.1%}" if left >= 0.0005 else "less than 0.1%"
+    return f", bounces beyond {recipe['bounces']} would add {share}"
 
 
 @app.command()
@@ -312,10 +356,22 @@ def _told_volume(source: str) -> None:
     typer.echo(f"  suggested range  {low:.4g} to {high:.4g}: {why}")
 
 
-def _told_lattice(name: str, volume: "Volume") -> None:
-    def three(numbers: Any) -> str:
-        return ", ".join(f"{x:.6g}" for x in numbers)
+def three(numbers: Any) -> str:
+    """Coordinates or a colour as text."""
+    return ", ".join(f"{x:.6g}" for x in numbers)
 
+
+def _told_wall(quad: "Quad", texture: "WallTexture") -> None:
+    rows, nv, nu = texture.values.shape[:3]
+    typer.echo(f"{quad.name} (wall)")
+    typer.echo(f"  corner           {three(quad.corner)}")
+    typer.echo(f"  edges            {three(quad.edge_u)}; {three(quad.edge_v)}")
+    glow = f", emission {three(quad.material.emission)}" if quad.material.emission.any() else ""
+    typer.echo(f"  albedo           {three(quad.material.albedo)}{glow}")
+    typer.echo(f"  light            {nu} x {nv} texels, {rows} isovalues")
+
+
+def _told_lattice(name: str, volume: "Volume") -> None:
     low, high = float(volume.values.min()), float(volume.values.max())
     typer.echo(f"{name}")
     typer.echo(f"  shape            {' x '.join(map(str, volume.shape))} voxels (x, y, z)")
@@ -337,15 +393,47 @@ def _told_run(source: str) -> None:
         typer.echo(
             f"  light            {' x '.join(map(str, grid.spec.shape))} nodes, {supported:.1%} with light of their own"
         )
+    for quad, texture in zip(light.scene.quads, light.walls):
+        _told_wall(quad, texture)
     recipe = light.recipe
     names = ", ".join(
         f"{kind} {recipe[kind]['name']}" for kind in ("sampler", "backend", "interpolator") if kind in recipe
     )
     typer.echo(
         f"recipe: {names}, {recipe.get('paths')} paths, {recipe.get('bounces')} bounces, seed {recipe.get('seed')}"
+        f"{_told_left_out(recipe)}"
     )
     for sentence in recipe.get("warnings", []):
         typer.echo(f"note: {sentence}")
+
+
+@app.command()
+def verify(
+    backends: Annotated[
+        list[str] | None,
+        typer.Option("--backend", metavar="NAME", help="Backend, repeatable. [default: all there are]"),
+    ] = None,
+    paths: Annotated[
+        int, typer.Option(min=1, metavar="N", help="Light paths a scene, shared by its queries; reference takes fewer.")
+    ] = 1 << 18,
+    seed: Annotated[int, typer.Option(min=0, max=2**64 - 1, metavar="N", help="Equal seeds give equal paths.")] = 0,
+) -> None:
+    """Judge the backends by scenes whose light has a closed form; exit 1 if one disagrees.
+
+    z is the mean difference over the queries in units of its standard error and of a derived bound on what the cells of
+    the surface do; max |z| is that of a single query.
+    """
+    from illumgrid.verify import HEADER, check, line
+
+    typer.echo(HEADER)
+    rows = []
+    for row in check(backends or None, paths, seed):
+        typer.echo(line(row))
+        rows.append(row)
+    wrong = sum(not row.agrees for row in rows)
+    typer.echo(f"{len(rows) - wrong} of {len(rows)} agree")
+    if wrong:
+        raise typer.Exit(1)
 
 
 def main() -> None:

@@ -34,7 +34,7 @@ def nucleons(count: int, turn: float) -> Floats:
 
 
 def nucleus() -> Scene:
-    """Densities of eight protons and eight neutrons in a box with a luminaire (after Figure 7 of Banks & Beason 2007)."""
+    """Densities of eight protons and eight neutrons in a box with a lamp (after Figure 7 of Banks & Beason 2007)."""
     protons = Material(np.array([0.85, 0.42, 0.28]))
     neutrons = Material(np.array([0.35, 0.55, 0.82]))
     limits = np.array([0.15, 0.75])
@@ -52,6 +52,7 @@ class Preset:
     make: Callable[[], Scene]
     grid: int
     paths: int
+    isovalues: int
 
 
-SCENES = {"nucleus": Preset(nucleus, grid=64, paths=64)}
+SCENES = {"nucleus": Preset(nucleus, grid=28, paths=96, isovalues=5)}

@@ -116,9 +116,8 @@ class WallTexture:
         place = np.broadcast_arrays(np.asarray(t) * (rows - 1), np.asarray(v) * nv - 0.5, np.asarray(u) * nu - 0.5)
         result = np.zeros((place[0].size, 3), dtype=np.float32)
         for channel in range(3):
-            map_coordinates(
-                self.values[..., channel], [p.ravel() for p in place], output=result[:, channel], order=1, mode="nearest"
-            )
+            light = self.values[..., channel]
+            map_coordinates(light, [p.ravel() for p in place], output=result[:, channel], order=1, mode="nearest")
         return result
 
 

@@ -175,7 +175,9 @@ def run(
     chosen = _stage("sampler", sampler, options), _stage("backend", backend), _stage("interpolator", interpolator)
     specs = [GridSpec.over(f.volume, min(max(f.volume.shape), LONGEST) if grid is None else grid) for f in scene.fields]
     if bounces is None:
-        bounces = enough_bounces(scene, chosen[1], seed)
+        bounces, left_out = enough_bounces(scene, chosen[1], seed)
+    else:
+        left_out = light_left_out(scene, chosen[1], bounces, seed)
     baked = bake(
         scene, specs, levels, *chosen, paths=range(paths), bounces=bounces, seed=seed, map=map, progress=progress
     )
@@ -192,7 +194,7 @@ def run(
         "grid": max(max(spec.shape) for spec in specs),
         "paths": paths,
         "bounces": bounces,
-        "left_out": light_left_out(scene, chosen[1], bounces, seed),
+        "left_out": left_out,
         "isovalues": len(levels.table),
         "seed": seed,
         "queries": baked.queries,

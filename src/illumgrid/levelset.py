@@ -137,6 +137,7 @@ def marchable(scene: Scene) -> Marchable:
     parts = [turned(f.volume, f.inside) for f in scene.fields]
     values = [p[0].reshape(-1) for p in parts]
     bricks = [p[1].reshape(-1) for p in parts]
+    materials = [f.material for f in scene.fields] + [q.material for q in scene.quads]
     return Marchable(
         values=values[0] if len(parts) == 1 else np.concatenate(values),
         start=np.cumsum([0, *(len(v) for v in values)], dtype=np.int64)[:-1],
@@ -146,8 +147,8 @@ def marchable(scene: Scene) -> Marchable:
         bricks=bricks[0] if len(parts) == 1 else np.concatenate(bricks),
         brick_start=np.cumsum([0, *(len(b) for b in bricks)], dtype=np.int64)[:-1],
         brick_shape=np.array([p[1].shape for p in parts], dtype=np.int64),
-        albedo=np.array([part.material.albedo for part in (*scene.fields, *scene.quads)]),
-        emission=np.array([part.material.emission for part in (*scene.fields, *scene.quads)]),
+        albedo=np.array([material.albedo for material in materials]),
+        emission=np.array([material.emission for material in materials]),
         background=np.array(scene.background),
         **_quads_in_frame(scene),
     )

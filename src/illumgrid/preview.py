@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 BACKGROUND = 0.045  # display-linear: a dark neutral, against which white surfaces and their shadows both stand out
 CAP_TONE = 0.22  # display radiance of a cap, for albedo 1: caps are cuts, not lit surfaces
-SIDE = 3  # sub-samples along each side of a pixel
+SIDE = 2  # sub-samples along each side of a pixel
 HALF_ANGLE = 0.27  # tangent of half the vertical angle of view, 30 degrees in all
 _ROWS = 24  # picture rows that are traced together: bounds the memory
 
@@ -58,7 +58,7 @@ def _column_ends(values: NDArray[np.float32], level: float) -> Floats:
 
 
 def _outline(scene: Scene, row: Floats) -> Floats:
-    """World points (m, 3) whose hull is that of the walls, and of the solids under a row of levels (volumes if none)."""
+    """World points (m, 3) whose hull is that of walls, and of the solids under a row of levels (volumes if none)."""
     found = []
     for field, level in zip(scene.fields, row * upward(scene)):
         values = turned(field.volume, field.inside)[0]
@@ -148,8 +148,9 @@ def _shade(
             facing = -np.einsum("ij,ij->i", normal[lit], direction[lit])
             color[lit] = WHITE * np.maximum(material.albedo, material.emission.clip(0, 1)) * facing[:, None]
         else:
-            at = (origin[lit] + t[lit, None] * direction[lit] - fields.quad_corner[number]) @ fields.quad_duals[number].T
-            shown = material.albedo / np.pi * light.walls[number].lookup(at[:, 0], at[:, 1], share) + material.emission
+            points = origin[lit] + t[lit, None] * direction[lit]
+            u, v = ((points - fields.quad_corner[number]) @ fields.quad_duals[number].T).T
+            shown = material.albedo / np.pi * light.walls[number].lookup(u, v, share) + material.emission
             color[lit] = shown * light.exposure
     return color
 

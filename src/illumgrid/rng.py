@@ -6,7 +6,7 @@ and are compiled unchanged by Numba. This file is frozen: another stream is anot
 
 Directions come in pairs of Owen-scrambled Sobol' points: within a pair each aligned run of 2^m paths is a (0, m, 2)-
 net: every box of 2^-a by 2^-b with a + b = m, on its lattice, holds exactly one path. So the paths of a query spread
-evenly over the hemisphere, however many there are. Different pairs are scrambled and shuffled independently ("padding").
+evenly over the hemisphere, however many there are. Pairs are scrambled and shuffled independently ("padding").
 
 References
 ----------

@@ -225,7 +225,7 @@ class Scene:
         fields, quads = tuple(self.fields), tuple(self.quads)
         if not fields:
             raise BadInput("the scene has no field; expected at least one")
-        names = [part.name for part in (*fields, *quads)]
+        names = [f.name for f in fields] + [q.name for q in quads]
         for name in names:
             if names.count(name) > 1:
                 raise BadInput(f"two parts of the scene have the name {name!r}; expected names that differ")
@@ -277,7 +277,7 @@ class Scene:
         inside: Side = "above",
         name: str = "field",
     ) -> "Scene":
-        """One field in a closed box, red wall left, green wall right, a luminaire at the bottom (the paper's Figure 5)."""
+        """One field in a closed box, red wall left, green right, a luminaire at the bottom (the paper's Figure 5)."""
         fields = cls.sky(volume, albedo, range, inside, name).fields
         return cls(fields, box_around(volume))
 
@@ -361,14 +361,14 @@ def box_around(volume: Volume, margin: float = 0.25) -> tuple[Quad, ...]:
     r, f, u = right * half[0], front * half[1], up * half[2]
     white, red, green = np.full(3, 0.75), np.array([0.63, 0.06, 0.05]), np.array([0.14, 0.45, 0.09])
     lamp = Quad(
-        "lamp", centre - 0.98 * u - 0.4 * r + 0.4 * f, 0.8 * r, -0.8 * f, Material(np.zeros(3), np.full(3, 8.0)), (4, 4)
+        "lamp", centre - 0.98 * u - 0.4 * r + 0.4 * f, 0.8 * r, -0.8 * f, Material(np.zeros(3), np.full(3, 8.0)), (1, 1)
     )
     return (
-        _wall("floor", centre - u, r, -f, white, (24, 24)),
-        _wall("ceiling", centre + u, r, f, white, (16, 16)),
-        _wall("left", centre - r, f, -u, red, (16, 16)),
-        _wall("right", centre + r, f, u, green, (16, 16)),
-        _wall("back", centre - f, r, u, white, (16, 16)),
-        _wall("front", centre + f, r, -u, white, (16, 16)),
+        _wall("floor", centre - u, r, -f, white, (12, 12)),
+        _wall("ceiling", centre + u, r, f, white, (6, 6)),
+        _wall("left", centre - r, f, -u, red, (6, 6)),
+        _wall("right", centre + r, f, u, green, (6, 6)),
+        _wall("back", centre - f, r, u, white, (6, 6)),
+        _wall("front", centre + f, r, -u, white, (6, 6)),
         lamp,
     )

@@ -251,7 +251,8 @@ def _rebuild(record: Record, parts: dict[str, dict[str, Image]]) -> Stored:
         values, support = (_array(texels[c], shape).swapaxes(0, 2) for c in ("RGB", "support"))
         walls.append(WallTexture(np.ascontiguousarray(values), np.ascontiguousarray(support)))
         material = Material(about["albedo"], about["emission"])
-        quads.append(Quad(about["name"], *(about[k] for k in EDGES), material, tuple(about["texels"])))
+        corner, edge_u, edge_v = (np.array(about[name], float) for name in EDGES)
+        quads.append(Quad(about["name"], corner, edge_u, edge_v, material, (shape[0], shape[1])))
     scene = Scene(tuple(fields), tuple(quads), record["scene"]["background"])
     return Stored(scene, Levels(np.array(record["levels"], float)), tuple(grids), tuple(walls), record["recipe"])
 

@@ -8,13 +8,13 @@ WHITE = 0.8
 
 
 def automatic_exposure(radiance: NDArray[np.floating]) -> float:
-    """Factor that brings the 98th percentile of the brightest channel of (n, 3) radiances to `WHITE`; 1 if all is dark.
+    """Factor that brings the 90th percentile of the brightest channel of (n, 3) radiances to `WHITE`; 1 if all is dark.
 
     The brightest channel, not the luminance: a saturated surface keeps its hue.
     """
     if not len(radiance):
         return 1.0
-    bright = float(np.quantile(radiance.max(axis=1), 0.98))
+    bright = float(np.quantile(radiance.max(axis=1), 0.9))
     return WHITE / bright if bright > 0 and np.isfinite(bright) else 1.0
 
 

@@ -164,7 +164,7 @@ def meet_quad(scene: Marchable, q: int, x: Floats, d: Floats) -> Floats:
 def nearest_hit(
     scene: Marchable, level: Floats, x: Floats, d: Floats, on: Ints, on_cap: Bools
 ) -> tuple[Floats, Ints, Ints, Ints]:
-    """First surface along frame rays: (t, number, what, axis of a cap), each (n,); fields are numbered first, then quads."""
+    """First surface along frame rays: (t, number, what, axis of a cap), each (n,); fields come first, then quads."""
     n, fields = len(x), len(scene.start)
     best, number, what, face = np.full(n, np.inf), np.full(n, -1), np.full(n, MISS), np.full(n, -1)
     for q in range(len(scene.quad_corner)):
@@ -324,7 +324,7 @@ def holes(scene: Marchable, level: Floats, x: Floats, normal: Floats, target: In
 
 
 def couples(paths: range) -> Iterator[tuple[int, int | None]]:
-    """Paths by twos that share a box of their net; two that are left, first and last, too; one alone is (path, None)."""
+    """Paths by twos that share a box of their net; two that are left, too; one alone is (path, None)."""
     alone = []
     at = paths.start
     while at < paths.stop:

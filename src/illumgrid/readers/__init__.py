@@ -1,4 +1,4 @@
-"""Volumes from files: whatever SimpleITK reads, NumPy arrays, and either of them gzipped.
+"""Volumes from files: whatever SimpleITK reads, NumPy arrays, and either of them gzipped; and scenes of volumes.
 
 A header is not believed: what it promises is held against the size of the file before anything that large is allocated.
 """
@@ -16,10 +16,11 @@ from tempfile import TemporaryDirectory
 
 from illumgrid.errors import BadInput
 from illumgrid.readers.arrays import read_npy, read_npz
+from illumgrid.readers.scene_file import read_scene
 from illumgrid.readers.sizes import AGAIN, CHUNK, DEFLATE
 from illumgrid.volume import Volume
 
-__all__ = ["read_volume", "volume_name"]
+__all__ = ["read_scene", "read_volume", "volume_name"]
 
 KNOWN = {
     *(".nrrd", ".nhdr", ".nii", ".hdr", ".img", ".mha", ".mhd", ".tif", ".tiff", ".mrc", ".rec", ".map", ".ccp4"),

@@ -1,0 +1,221 @@
+"""How many rays a second find what they hit: ``python benchmarks/rays.py [--json FILE]``.
+
+The same rays in one run, in random order and sorted by origin, against the marching-cubes mesh of a level set (`bvh`,
+and `embreex` where it is installed) and through its trilinear field (`marching`):
+
+surface
+    Cosine-distributed rays from points on one level set of a smooth 128³ field, the sum of forty Gaussians: 140,000
+    triangles. One ray in eighteen hits something, but most pass many triangles closely.
+cavity
+    Rays in all directions from inside the sealed caves of a 64³ field of noise, 150,000 triangles: all hit something.
+
+One thread each, then two against one, beside a bare loop that shows what the machine has to give just then. The
+contenders take turns, so that whatever else the machine does meets all of them alike: a rate is the best of nine rounds
+of thread time, a ratio the median of the ratios within the rounds, of wall clock where it is about two threads. What
+they build first is timed as well, the best of three, in processor seconds: of embreex all threads together.
+"""
+
+import argparse
+import importlib.util
+import json
+import time
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+
+import numba
+import numpy as np
+from scipy.ndimage import gaussian_filter
+
+from illumgrid import Queries, Scene, Volume, isosurface
+from illumgrid.backends import bvh
+from illumgrid.backends.kernels import cast_rays
+from illumgrid.levelset import in_frame, marchable
+
+RAYS, ROUNDS = 200_000, 9
+ISOVALUE, WALL = 0.4, 0.31
+OFF = 0.01  # voxels: where rays that leave a surface start, for those who only know the mesh
+
+
+def gaussians(voxels=128, count=40, seed=1):
+    """Sum of `count` Gaussians of random place and width on -1 to 1."""
+    random = np.random.default_rng(seed)
+    axis = np.linspace(-1, 1, voxels)
+    values = np.zeros((voxels, voxels, voxels))
+    for _ in range(count):
+        centre, sigma = random.uniform(-0.7, 0.7, 3), random.uniform(0.08, 0.25)
+        along = np.exp(-((axis[:, None] - centre) ** 2) / (2 * sigma**2))
+        values += np.einsum("i,j,k->ijk", *along.T)
+    return Volume(values)
+
+
+def caves(voxels=64, seed=3):
+    """Smooth noise in a shell of solid: every cave in it is sealed."""
+    noise = gaussian_filter(np.random.default_rng(seed).normal(size=(voxels, voxels, voxels)), 2.5)
+    return Volume(np.pad(noise / noise.std(), 1, constant_values=9.0))
+
+
+def rays_from(scene, mesh, seed=2):
+    """Points on the level set, and cosine directions about their normals."""
+    random = np.random.default_rng(seed)
+    queries = Queries.at(scene, mesh.vertices[random.integers(0, len(mesh.vertices), RAYS)], level=ISOVALUE)
+    point, normal, _ = in_frame(scene, queries)
+    direction = normal + directions(random)
+    return point, direction / np.linalg.norm(direction, axis=1, keepdims=True)
+
+
+def rays_inside(volume, seed=9):
+    """Voxels in the caves, away from the wall, and directions all around."""
+    random = np.random.default_rng(seed)
+    inside = np.argwhere(volume.values < 0.0).astype(float)
+    return inside[random.integers(len(inside), size=RAYS)], directions(random)
+
+
+def directions(random):
+    """Unit vectors, uniform on the sphere."""
+    sphere = random.normal(size=(RAYS, 3))
+    return sphere / np.linalg.norm(sphere, axis=1, keepdims=True)
+
+
+def race(contenders, rounds=ROUNDS, clock=time.thread_time):
+    """Seconds (rounds, contenders): they take turns, after one round to warm up."""
+    seconds = []
+    for _ in range(rounds + 1):
+        seconds.append([])
+        for work in contenders:
+            start = clock()
+            work()
+            seconds[-1].append(clock() - start)
+    return np.array(seconds[1:])
+
+
+def embree_scene(mesh):
+    """Scene of embreex, its tree built, which the first ray causes."""
+    from embreex.mesh_construction import TriangleMesh
+    from embreex.rtcore_scene import EmbreeScene
+
+    embree = EmbreeScene()
+    TriangleMesh(embree, mesh.vertices.astype(np.float32), mesh.faces.astype(np.int32))
+    embree.run(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32))
+    return embree
+
+
+def contenders(fields, tree, embree, level, on, origin, direction):
+    """How each casts these rays, and the distances it fills; `on` is 0 where rays leave the surface, else -1."""
+    n = len(origin)
+    start = origin + OFF * direction if on >= 0 else origin
+    along_mesh, along_field = np.zeros(n), np.zeros(n)
+    work = {
+        "bvh": partial(
+            bvh.cast_rays, tree, bvh.stack_for(tree), start, direction, np.inf, False,
+            along_mesh, np.zeros(n, np.int64), np.zeros((n, 2), np.float32),
+        ),
+        "marching": partial(
+            cast_rays, fields, np.array([level]), origin, direction, on,
+            along_field, np.zeros(n, np.int64), np.zeros(n, np.int64), np.zeros((n, 3)),
+        ),
+    }  # fmt: skip
+    if embree:
+        work["embreex"] = partial(embree.run, start.astype(np.float32), direction.astype(np.float32), query="DISTANCE")
+    return work, {"bvh": along_mesh, "marching": along_field}
+
+
+def one_thread(work, distances):
+    """Rate, ratio to embreex and share of hits of each."""
+    seconds = dict(zip(work, race(work.values()).T))
+    figures = {name: {"million rays a second": RAYS / spent.min() / 1e6} for name, spent in seconds.items()}
+    for name, spent in seconds.items():
+        if "embreex" in seconds:
+            figures[name]["times embreex"] = float(np.median(seconds["embreex"] / spent))
+        if name in distances:
+            figures[name]["hit"] = float(np.isfinite(distances[name]).mean())
+    return figures
+
+
+@numba.njit(nogil=True)
+def bare_loop(count):
+    """Arithmetic that touches no memory."""
+    total = 0.0
+    for i in range(count):
+        total += (0.5 * i) % 3.0
+    return total
+
+
+def two_threads(halves):
+    """How many times faster two threads cast both halves than one, by the clock on the wall."""
+    pairs = {name: [half[name] for half in halves] for name in halves[0]}
+    pairs["bare loop"] = [partial(bare_loop, 10_000_000)] * 2
+    with ThreadPoolExecutor(2) as pool:
+
+        def one(both):
+            for work in both:
+                work()
+
+        def two(both):
+            list(pool.map(lambda work: work(), both))
+
+        ways = [partial(way, both) for both in pairs.values() for way in (one, two)]
+        seconds = race(ways, clock=time.perf_counter)
+    return dict(zip(pairs, np.median(seconds[:, ::2] / seconds[:, 1::2], axis=0).tolist()))
+
+
+def measure(scene, mesh, level, on, origin, direction):
+    """All figures of one scene."""
+    volume = scene.fields[0].volume
+    builds = {
+        "bricks": lambda: marchable(
+            Scene.sky(Volume(volume.values), range=(level, level + 0.1))
+        ),  # a volume keeps them
+        "isosurface": partial(isosurface, volume, level),
+        "bvh": partial(bvh.build, mesh.vertices, mesh.faces),
+    }
+    if importlib.util.find_spec("embreex"):
+        builds["embreex"] = partial(embree_scene, mesh)
+    seconds = race(builds.values(), 3, time.process_time).min(axis=0)
+    figures = {"triangles": len(mesh.faces), "build": dict(zip(builds, seconds.tolist()))}
+
+    fields, tree = marchable(scene), bvh.build(mesh.vertices, mesh.faces)
+    embree = embree_scene(mesh) if "embreex" in builds else None
+    for name, order in (("random", np.arange(RAYS)), ("sorted", np.lexsort((origin // 8).T))):
+        p, d = origin[order], direction[order]
+        figures[name] = one_thread(*contenders(fields, tree, embree, level, on, p, d))
+    halves = [contenders(fields, tree, None, level, on, p[k::2].copy(), d[k::2].copy())[0] for k in range(2)]
+    figures["two threads"] = two_threads(halves)
+    return figures
+
+
+def show(scene, figures):
+    """Print the figures of one scene."""
+    print(f"{scene}: {figures['triangles']} triangles, {RAYS} rays")
+    print(f"  {'':26} {'Mrays/s':>8} {'x embreex':>10} {'hit':>8}")
+    for order in ("random", "sorted"):
+        for who, found in figures[order].items():
+            ratio = f"{found['times embreex']:10.2f}" if "times embreex" in found else " " * 10
+            hit = f"{found['hit']:8.2%}" if "hit" in found else ""
+            print(f"  {order + ', ' + who:26} {found['million rays a second']:8.2f} {ratio} {hit}")
+    print("  two threads over one:      " + ", ".join(f"{who} {f:.2f}" for who, f in figures["two threads"].items()))
+    print("  to build, CPU seconds:     " + ", ".join(f"{who} {f:.3f}" for who, f in figures["build"].items()))
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--json", help="write the figures here")
+    asked = parser.parse_args()
+    figures = {}
+
+    scene = Scene.sky(gaussians(), range=(0.2, 0.9))
+    mesh = isosurface(scene.fields[0].volume, ISOVALUE)
+    figures["surface"] = measure(scene, mesh, ISOVALUE, 0, *rays_from(scene, mesh))
+    show("surface", figures["surface"])
+
+    scene = Scene.sky(caves(), range=(0.1, 0.5))
+    mesh = isosurface(scene.fields[0].volume, WALL)
+    figures["cavity"] = measure(scene, mesh, WALL, -1, *rays_inside(scene.fields[0].volume))
+    show("cavity", figures["cavity"])
+
+    if asked.json:
+        with open(asked.json, "w") as file:
+            json.dump(figures, file, indent=2)
+
+
+if __name__ == "__main__":
+    main()

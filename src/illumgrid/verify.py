@@ -1,0 +1,167 @@
+"""Closed forms against backends: a table of z-scores."""
+
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from statistics import NormalDist
+
+import numpy as np
+
+from illumgrid import registry
+from illumgrid.analytic import CASES, Case
+from illumgrid.errors import BadInput
+from illumgrid.stages import Backend
+from illumgrid.volume import Floats
+
+_FALSE_ALARM = 1e-3
+"""Probability that a table of right answers has a row that disagrees."""
+
+_SLOWER = {"reference": 128}  # times fewer paths
+
+
+@dataclass(frozen=True)
+class Row:
+    """One case judged with one backend.
+
+    Parameters
+    ----------
+    scene, backend : str
+    reason : str
+        The closed form.
+    expected, measured : float
+        Means over the queries, of the colour that differs most.
+    z : float
+        Mean difference in units of its standard error and discretisation bound; infinite if a query got no answer.
+    worst : float
+        Largest such |difference| of a single query.
+    agrees : bool
+    seconds : float
+    """
+
+    scene: str
+    backend: str
+    reason: str
+    expected: float
+    measured: float
+    z: float
+    worst: float
+    agrees: bool
+    seconds: float
+
+
+HEADER = f"{'scene':30} {'backend':10} {'expected':>10} {'measured':>10} {'z':>7} {'max |z|':>8}  verdict"
+
+
+def line(row: Row) -> str:
+    """A row as text, below `HEADER`."""
+    numbers = f"{row.expected:10.5g} {row.measured:10.5g} {row.z:7.2f} {row.worst:8.2f}"
+    return f"{row.scene:30} {row.backend:10} {numbers}  {'agrees' if row.agrees else 'DISAGREES'} ({row.reason})"
+
+
+def available() -> list[str]:
+    """Names of the backends that work on this machine."""
+    names = []
+    for name in ("numba", "embree", "reference"):
+        try:
+            registry.backend(name)
+        except (BadInput, ImportError):
+            continue
+        names.append(name)
+    return names
+
+
+def sidak(tests: int, level: float) -> float:
+    """|z| that any of `tests` independent standard normal numbers exceeds with probability `level`.
+
+    References
+    ----------
+    .. [1] Z. Šidák, "Rectangular confidence regions for the means of multivariate normal distributions", J. Amer.
+           Statist. Assoc. 62(318), 1967.
+    """
+    return NormalDist().inv_cdf(0.5 * (1 + (1 - level) ** (1 / tests)))
+
+
+def _score(off: Floats, bar: Floats, bound: Floats) -> tuple[Floats, Floats]:
+    """Score z of the mean over queries (3,), and of each query (n, 3), from differences and standard errors (n, 3)."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        # The bound is a bias: over many queries it does not average out.
+        whole = off.mean(axis=0) / np.hypot(np.sqrt((bar**2).sum(axis=0)) / len(off), bound.mean())
+        # A bar from few paths can be too short by luck: none is taken to be shorter than their root mean square.
+        least = np.sqrt((bar**2).mean(axis=0))
+        each = off / np.hypot(np.maximum(bar, least), bound[:, None])
+    return np.where(off.mean(axis=0) == 0, 0.0, whole), np.where(off == 0, 0.0, each)
+
+
+def _measure(case: Case, backend: Backend, paths: int, seed: int) -> tuple[Floats, Floats, bool]:
+    """What a backend finds for `expected`, its standard error, and whether all queries were answered."""
+    # A power of two suits scrambled sequences.
+    least = 4 if case.area is None else 0  # the spread of a query's own paths is asked for
+    count = 1 << max(least, int(np.log2(max(1, paths / len(case.queries)))))
+    answer = backend.solve(case.scene, case.queries, paths=range(count), bounces=case.bounces, seed=seed)
+    light = answer.mean.astype(float)
+    if case.area is None:
+        return light, answer.stderr.astype(float), bool((answer.paths > 0).all())
+    if case.kept is not None:
+        fewer = backend.solve(case.scene, case.queries, paths=range(count), bounces=case.bounces - 1, seed=seed)
+        light -= case.kept * fewer.mean
+    light *= case.area[:, None]
+    # Twice the variance of one point of a cell is the mean of (y1 - y2)², and it is the variance of y1 + y2.
+    bar = np.sqrt(((light[::2] - light[1::2]) ** 2).sum(axis=0))
+    return light.sum(axis=0)[None], bar[None], True
+
+
+def judge(case: Case, backend: Backend, paths: int, seed: int, limit: float, limit_each: float) -> Row:
+    """Trace about `paths` paths, shared by the queries of a case; it agrees if no |z| is above its limit."""
+    begun = time.perf_counter()
+    measured, bar, answered = _measure(case, backend, paths, seed)
+    whole, each = _score(measured - case.expected, bar, case.bound)
+    worst = float(np.abs(each).max()) if answered else np.inf
+    color = int(np.abs(whole).argmax())
+    z = float(whole[color]) if answered else np.inf
+    return Row(
+        scene=case.name,
+        backend=backend.name,
+        reason=case.reason,
+        expected=float(case.expected[:, color].mean()),
+        measured=float(measured[:, color].mean()),
+        z=z,
+        worst=worst,
+        agrees=abs(z) <= limit and worst <= limit_each,
+        seconds=time.perf_counter() - begun,
+    )
+
+
+def check(
+    backends: Iterable[str | Backend] | None = None,
+    paths: int = 1 << 18,
+    seed: int = 0,
+    cases: Sequence[Case] | None = None,
+) -> Iterator[Row]:
+    """Judge every case with every backend.
+
+    Parameters
+    ----------
+    backends : iterable of str or Backend, optional
+        By default all that are available.
+    paths : int
+        Light paths for each case, shared by its queries; `reference`, which is slow, traces fewer.
+    seed : int
+    cases : sequence of Case, optional
+        By default all of `illumgrid.analytic.CASES`.
+
+    Yields
+    ------
+    Row
+        As soon as it is judged. Right answers get a row that disagrees once in a thousand tables.
+    """
+    if paths < 1:
+        raise BadInput(f"{paths} paths were asked for; expected at least 1")
+    asked = available() if backends is None else backends
+    stages = [registry.backend(b) if isinstance(b, str) else b for b in asked]
+    cases = [make() for make in CASES] if cases is None else cases
+    level = _FALSE_ALARM / 2  # one half for the means, one for the single queries
+    limit = sidak(max(1, 3 * len(cases) * len(stages)), level)
+    limit_each = sidak(max(1, 3 * sum(len(case.expected) for case in cases) * len(stages)), level)
+    for backend in stages:
+        for case in cases:
+            yield judge(case, backend, paths // _SLOWER.get(backend.name, 1), seed, limit, limit_each)

@@ -1,0 +1,39 @@
+"""The command line as a function: what all tests of it share."""
+
+import numpy as np
+import pytest
+
+from illumgrid import cli, preview
+from shapes import ball
+
+
+@pytest.fixture
+def call(capsys, tmp_path, monkeypatch):
+    """Run a command in a folder of its own, with small pictures; returns what it said."""
+    monkeypatch.setattr(preview.render, "__kwdefaults__", {"width": 64, "height": 48, "local": False})
+    monkeypatch.chdir(tmp_path)
+    np.save(tmp_path / "v.npy", ball(10).values)
+
+    def call(*args, code=0):
+        result = cli.guarded(lambda: cli.app([str(a) for a in args], standalone_mode=False))
+        said = "".join(capsys.readouterr())
+        assert result == code, said
+        assert "Traceback" not in said
+        return said
+
+    return call
+
+
+@pytest.fixture
+def refuse(call, tmp_path):
+    """A command is refused in one sentence with these words, and nothing is written."""
+
+    def refuse(*args, words):
+        before = sorted(tmp_path.rglob("*"))
+        said = call(*args, code=2).strip()
+        assert said.count("\n") == 0 and said.startswith("illumgrid: ") and ". " not in said, said
+        for word in words:
+            assert word in said, said
+        assert sorted(tmp_path.rglob("*")) == before
+
+    return refuse
