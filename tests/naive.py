@@ -297,10 +297,13 @@ class Wall:
         offset = [x[i] - self.corner[i] for i in range(3)]
         a, b, t = np.linalg.solve(matrix, offset)
         approach = sum(a * b for a, b in zip(self.normal, d))
-        depth = sum(a * b for a, b in zip(self.normal, offset))
-        if t < 0 and approach < 0 and -depth <= WALL * sum(map(abs, offset)):
+        height = sum(a * b for a, b in zip(self.normal, offset))
+        behind = height < -WALL * sum(map(abs, [*offset, *self.u, *self.v]))  # what lies on it is in front of it
+        if behind != (approach > 0):
+            return None
+        if t < 0:
             t, (a, b) = 0.0, np.linalg.lstsq(matrix[:, :2], np.array(offset), rcond=None)[0]
-        if t < 0 or not (-WALL <= a <= 1 + WALL and -WALL <= b <= 1 + WALL):
+        if not (-WALL <= a <= 1 + WALL and -WALL <= b <= 1 + WALL):
             return None
         side = -1.0 if approach > 0 else 1.0
         return Hit(float(t), self.number, [x[i] + t * d[i] for i in range(3)], [side * c for c in self.normal])

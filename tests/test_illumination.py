@@ -52,9 +52,17 @@ def test_the_recipe_says_how_it_was_made(light):
     }  # fmt: skip
     assert recipe["queries"] > 100 and recipe["holes"] == [0]
     assert recipe["seconds"].keys() == {"sampler", "backend", "interpolator"}
-    assert 0 < recipe["relative_error"][0] < 1
+    assert recipe["relative_error"] == [0.0]  # a ball: every path escapes, and is worth the same
     assert recipe["versions"] == {name: version(name) for name in ("illumgrid", "numpy", "numba", "scipy")}
     assert json.loads(json.dumps(recipe, allow_nan=False)) == recipe
+
+
+def test_the_error_told_is_that_of_the_nodes():
+    rough = ig.Volume(np.random.default_rng(0).random((6, 6, 6)))
+    light = ig.run(ig.Scene.sky(rough, range=(0.3, 0.7)), paths=16, bounces=1)
+    known = light.grids[0].support > 0
+    expected = np.sqrt((light.grids[0].error[known].astype(float) ** 2).mean()) / light.grids[0].values[known].mean()
+    assert light.recipe["relative_error"] == [pytest.approx(expected)] and 0.02 < expected < 0.5
 
 
 def test_one_path_has_no_error_to_tell():

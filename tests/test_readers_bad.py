@@ -116,8 +116,6 @@ def test_memory_error_is_told(tmp_path, monkeypatch):
     refused(tmp_path / "a.npy", "memory")
 
 
-
-
 @pytest.mark.parametrize("ending", WRITERS)
 def test_cut_file(tmp_path, ending, capfd):
     file = tmp_path / f"a.{ending}"

@@ -358,7 +358,7 @@ def _told_volume(source: str) -> None:
 
 def three(numbers: Any) -> str:
     """Coordinates or a colour as text."""
-    return ", ".join(f"{x:.6g}" for x in numbers)
+    return ", ".join(f"{x + 0.0:.6g}" for x in numbers)  # no -0
 
 
 def _told_wall(quad: "Quad", texture: "WallTexture") -> None:

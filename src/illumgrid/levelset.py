@@ -102,6 +102,7 @@ class Marchable(NamedTuple):
     quad_edges: Floats  # (Q, 2, 3)
     quad_duals: Floats  # (Q, 2, 3): dot with a point from the corner gives its shares (0 to 1) along the edges
     quad_normal: Floats  # (Q, 3) towards the front
+    quad_size: Floats  # (Q,) how large its edges are: rounding errors are a share of it
     lamps: NDArray[np.int64]  # (L,) numbers of the quads that emit
     lamp_share: Floats  # (L,) running sum of the probability to choose a lamp, in proportion to its power
     lamp_density: Floats  # (Q,) probability to choose a point of the quad, per area; 0 if it does not emit
@@ -170,6 +171,7 @@ def _quads_in_frame(scene: Scene) -> dict[str, NDArray[Any]]:
         "quad_edges": edges,
         "quad_duals": across / (edges * across).sum(axis=2, keepdims=True),
         "quad_normal": normal,
+        "quad_size": np.abs(edges).sum(axis=(1, 2)),
         "lamps": lamps,
         "lamp_share": np.cumsum(chance[lamps]),
         "lamp_density": chance / area if count else power,

@@ -262,20 +262,19 @@ def dot(a, b):
 def meet_quad(scene, q, x, d):
     """Distance t at which the frame ray x + t d meets quad q; inf if it does not.
 
-    A ray that comes from the front may start behind by a rounding error, as at the edge that two walls share: it meets
-    the quad at once.
+    What lies on the quad but for a rounding error, as at the edge that two walls share or on a floor, is in front of it:
+    a ray that leaves for the back meets it at once, one that leaves for the front does not.
     """
     normal = scene.quad_normal[q]
     approach = dot(normal, d)
     if approach == 0.0:
         return np.inf
     ox, oy, oz = x[0] - scene.quad_corner[q, 0], x[1] - scene.quad_corner[q, 1], x[2] - scene.quad_corner[q, 2]
-    t = -(normal[0] * ox + normal[1] * oy + normal[2] * oz) / approach
-    size = abs(ox) + abs(oy) + abs(oz)
-    if t < 0.0:
-        if approach > 0.0 or -t * -approach > ON_A_WALL * size:
-            return np.inf
-        t = 0.0
+    height = normal[0] * ox + normal[1] * oy + normal[2] * oz
+    on_it = ON_A_WALL * (abs(ox) + abs(oy) + abs(oz) + scene.quad_size[q])
+    if (height < -on_it) != (approach > 0.0):
+        return np.inf
+    t = max(-height / approach, 0.0)
     at = (ox + t * d[0], oy + t * d[1], oz + t * d[2])
     u, v = dot(scene.quad_duals[q, 0], at), dot(scene.quad_duals[q, 1], at)
     if -ON_A_WALL <= u <= 1.0 + ON_A_WALL and -ON_A_WALL <= v <= 1.0 + ON_A_WALL:

@@ -147,18 +147,16 @@ def march(v: NDArray[np.float32], level: Floats, u: Floats, d: Floats, on_surfac
 def meet_quad(scene: Marchable, q: int, x: Floats, d: Floats) -> Floats:
     """Distance (n,) at which frame rays meet quad q, inf if they do not.
 
-    A ray from the front may start behind by a rounding error, as at the edge that two walls share: it meets at once.
+    What lies on the quad but for a rounding error is in front of it: a ray that leaves for the back meets it at once.
     """
-    normal, offset = scene.quad_normal[q], x - scene.quad_corner[q]
-    approach = d @ normal
+    offset = x - scene.quad_corner[q]
+    approach, height = d @ scene.quad_normal[q], offset @ scene.quad_normal[q]
+    behind = height < -ON_A_WALL * (np.abs(offset).sum(axis=1) + scene.quad_size[q])
     with np.errstate(divide="ignore", invalid="ignore"):
-        t = -(offset @ normal) / approach
-    late = (t < 0) & (approach < 0) & (t * approach <= ON_A_WALL * np.abs(offset).sum(axis=1))
-    t = np.where(late, 0.0, t)
-    with np.errstate(invalid="ignore"):
+        t = np.maximum(-height / approach, 0.0)
         share = (offset + t[:, None] * d) @ scene.quad_duals[q].T
-    within = ((share >= -ON_A_WALL) & (share <= 1 + ON_A_WALL)).all(axis=1)
-    return np.where(within & (t >= 0) & (approach != 0), t, np.inf)
+        within = ((share >= -ON_A_WALL) & (share <= 1 + ON_A_WALL)).all(axis=1)
+    return np.where(within & (approach != 0) & (behind == (approach > 0)), t, np.inf)
 
 
 def nearest_hit(
