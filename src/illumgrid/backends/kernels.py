@@ -262,7 +262,7 @@ def dot(a, b):
 def meet_quad(scene, q, x, d):
     """Distance t at which the frame ray x + t d meets quad q; inf if it does not.
 
-    What lies on the quad but for a rounding error, as at the edge that two walls share or on a floor, is in front of it:
+    What lies on the quad but for a rounding error, as at an edge that two walls share or on a floor, is in front of it:
     a ray that leaves for the back meets it at once, one that leaves for the front does not.
     """
     normal = scene.quad_normal[q]
