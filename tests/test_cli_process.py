@@ -20,7 +20,11 @@ COMMAND = (sys.executable, "-m", "illumgrid")
 
 
 def start(*args, cwd, said=subprocess.DEVNULL):
-    return subprocess.Popen([*COMMAND, *args], cwd=cwd, stdout=subprocess.DEVNULL, stderr=said, text=True)
+    def hear() -> None:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)  # a shell's background jobs are born deaf to Ctrl-C
+
+    out = subprocess.DEVNULL
+    return subprocess.Popen([*COMMAND, *args], cwd=cwd, stdout=out, stderr=said, text=True, preexec_fn=hear)
 
 
 @pytest.fixture

@@ -68,7 +68,7 @@ def _outline(scene: Scene, row: Floats) -> Floats:
     if not sum(map(len, found)):
         corners = np.array(list(np.ndindex(2, 2, 2)))
         found = [index_to_world(f.volume, corners * (np.array(f.volume.shape) - 1)) for f in scene.fields]
-    for quad in scene.quads:
+    for quad in () if scene.background.any() else scene.quads:  # a room is seen whole, a floor under a sky goes on
         found.append(quad.corner + np.array([np.zeros(3), quad.edge_u, quad.edge_v, quad.edge_u + quad.edge_v]))
     return np.concatenate(found)
 
