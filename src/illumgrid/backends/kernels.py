@@ -17,7 +17,9 @@ for _function in (mix, stream, draw, reverse, pascal, upward, draw_pair, net_siz
     register_jitable(_function)
 
 # No fastmath: a miss is t = inf, and the sign of a coefficient near zero decides the side.
-jit = numba.njit(cache=True, nogil=True, error_model="numpy")
+# Nor Numba's reference counts: nothing is allocated here, the caller keeps the arrays alive, and the atomic counts of a
+# scene handed from function to function cost a third of the time.
+jit = numba.njit(cache=True, nogil=True, error_model="numpy", _nrt=False)  # type: ignore[call-overload]
 
 MISS, SURFACE, CAP, BURIED, QUAD = 0, 1, 2, 3, 4  # a ray meets nothing, a level set, a cap, a solid's inside, a quad
 BRICK_SHIFT = 2  # bricks of 4 cells a side, as in levelset.BRICK
