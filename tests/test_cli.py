@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 import illumgrid as ig
-from illumgrid import cli
+from illumgrid.cli.info import BLOCKS, histogram_line
 from shapes import MIRRORED, ball, sampled
 
 QUICK = ("--grid", "8", "--paths", "2", "--bounces", "1")
@@ -214,13 +214,13 @@ def test_info_tells_of_a_volume_what_is_worth_knowing(call, tmp_path):
     for word in ("10 x 10 x 10 voxels", "0.5, 1, 2", "1, 2, 3", "LPS", f"{low:.4g} to {high:.4g}", why):
         assert word in said
     line = said.split("|")[1]
-    assert len(line) == 64 and set(line) <= set(cli.BLOCKS) and "█" in line
+    assert len(line) == 64 and set(line) <= set(BLOCKS) and "█" in line
 
 
 def test_the_histogram_has_blocks_where_there_are_values():
     values = np.zeros((4, 4, 4))
     values.flat[:3] = 1, 1, 0.5
-    line = cli.histogram_line(ig.Volume(values), 4)
+    line = histogram_line(ig.Volume(values), 4)
     assert line[0] == "█" and line[1] == " " and line[2] in "▁▂▃" and line[3] in "▂▃▄▅"
 
 

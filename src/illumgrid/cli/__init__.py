@@ -1,0 +1,71 @@
+"""The command line: one file a command; nothing else of the package prints."""
+
+import sys
+from collections.abc import Callable
+from typing import Annotated, Any
+
+import typer
+
+from illumgrid.cli.info import info
+from illumgrid.cli.preview import preview
+from illumgrid.cli.run import run
+from illumgrid.cli.told import say
+from illumgrid.cli.verify import verify
+from illumgrid.errors import BadInput
+
+app = typer.Typer(
+    help="Global illumination for every isosurface of a volume at once.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+for command in (run, preview, info, verify):
+    app.command()(command)
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        from importlib.metadata import version
+
+        typer.echo(f"illumgrid {version('illumgrid')}")
+        raise typer.Exit
+
+
+@app.callback()
+def root(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Show the version and exit.")
+    ] = False,
+) -> None:
+    """Global illumination for every isosurface of a volume at once."""
+
+
+def main() -> None:
+    """Run the command line: exit 2 and one sentence on bad input, 130 on Ctrl-C."""
+    sys.exit(guarded(lambda: app(standalone_mode=False)))
+
+
+def guarded(command: Callable[[], Any]) -> int:
+    """Exit code of a command."""
+    try:
+        code = command()
+        if code == 130:  # what typer makes of Ctrl-C
+            raise KeyboardInterrupt
+        return code if isinstance(code, int) else 0
+    except (typer.Abort, KeyboardInterrupt):
+        say("illumgrid: stopped; nothing was written")
+        return 130
+    except BadInput as error:
+        say(f"illumgrid: {error}")
+    except MemoryError:
+        say("illumgrid: the memory of this machine is too small for this; choose a coarser --grid or a smaller volume")
+    except OSError as error:
+        say(f"illumgrid: {error.strerror or error}{f': {error.filename}' if error.filename else ''}")
+    except Exception as error:
+        if not hasattr(
+            error, "show"
+        ):  # a usage error: of click's, or of typer's own copy of click, as its release has it
+            raise
+        error.show()
+    return 2

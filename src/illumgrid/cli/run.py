@@ -1,0 +1,202 @@
+"""``illumgrid run``: the whole chain, from a volume or a scene to a finished folder."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from illumgrid.cli.told import heard, say, told_left_out, told_progress
+from illumgrid.errors import BadInput
+
+if TYPE_CHECKING:
+    from illumgrid.demo import Preset
+    from illumgrid.illumination import Illumination
+    from illumgrid.scene import Scene
+    from illumgrid.volume import Side
+
+
+def _given(**options: Any) -> str:
+    """Names of the options that were given, as typed."""
+    return ", ".join(f"--{name}" for name, value in options.items() if value is not None)
+
+
+@dataclass(frozen=True)
+class Input:
+    """What is to be lit: a name for the folder of the result, and how the scene is made, blurred by `smooth` voxels."""
+
+    name: str
+    make: Callable[[float], "Scene"]
+    preset: "Preset | None" = None
+
+
+def _input(
+    source: str | None,
+    surroundings: str | None,
+    limits: tuple[float, float] | None,
+    inside: str | None,
+    albedo: tuple[float, float, float] | None,
+) -> Input:
+    """Tell a volume file from a scene file and a built-in scene; nothing is read yet."""
+    from illumgrid.demo import SCENES
+    from illumgrid.readers import volume_name
+
+    name = source or "nucleus"
+    preset = SCENES.get(name) if source is None or not Path(source).exists() else None
+    if preset or name.lower().endswith(".toml"):
+        if extra := _given(scene=surroundings, range=limits, inside=inside, albedo=albedo):
+            what, todo = ("built-in scene", "leave") if preset else ("scene file", "write them into the file and leave")
+            raise BadInput(f"{extra} came with the {what} {name!r}; expected a volume file with them: {todo} them out")
+        return Input(name, partial(_smoothed, preset.make), preset) if preset else _scene_file(name)
+    if inside not in (None, "above", "below"):
+        raise BadInput(f"--inside is {inside!r}; expected above or below")
+    if surroundings not in (None, "sky", "floor", "box"):
+        raise BadInput(f"--scene is {surroundings!r}; expected sky, floor or box")
+    side: Side = "below" if inside == "below" else "above"
+    make = partial(_volume_scene, name, surroundings or "sky", albedo or (0.8, 0.8, 0.8), limits, side)
+    return Input(volume_name(name), make)
+
+
+def _scene_file(name: str) -> Input:
+    from illumgrid.readers import read_scene
+
+    return Input(Path(name).stem, lambda smooth: read_scene(name, smoothing=smooth))
+
+
+def _volume_scene(source: str, surroundings: str, albedo: Any, limits: Any, inside: "Side", smooth: float) -> "Scene":
+    from illumgrid.readers import read_volume, volume_name
+    from illumgrid.scene import Scene
+    from illumgrid.volume import finite
+    from illumgrid.volume import smooth as blur
+
+    around = {"sky": Scene.sky, "floor": Scene.floor, "box": Scene.box}[surroundings]
+    return around(blur(finite(read_volume(source), inside), smooth), albedo, limits, inside, volume_name(source))
+
+
+def _smoothed(make: Callable[[], "Scene"], smooth: float) -> "Scene":
+    from illumgrid.volume import smooth as blur
+
+    scene = make()
+    return replace(scene, fields=tuple(replace(f, volume=blur(f.volume, smooth)) for f in scene.fields))
+
+
+def _stage_options(settings: list[str]) -> dict[str, dict[str, str]]:
+    """`STAGE.OPTION=VALUE` texts, by stage."""
+    options: dict[str, dict[str, str]] = {"sampler": {}, "backend": {}, "interpolator": {}}
+    for text in settings:
+        place, equals, value = text.partition("=")
+        stage, dot, option = place.partition(".")
+        if not (equals and dot and option) or stage not in options:
+            raise BadInput(
+                f"--set got {text!r}; expected STAGE.OPTION=VALUE with STAGE one of {', '.join(options)}, "
+                "such as sampler.count=40"
+            )
+        options[stage][option] = value
+    return options
+
+
+def run(
+    source: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="[INPUT]",
+            help="A volume file, DICOM folder, scene file (.toml) or built-in scene: nucleus. [default: nucleus]",
+        ),
+    ] = None,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", metavar="DIR", help="Where the result goes. [default: INPUT-light]")
+    ] = None,
+    sampler: Annotated[str, typer.Option(help="Where to ask for light: direct, uniform.")] = "direct",
+    isovalues: Annotated[
+        int | None, typer.Option(min=2, metavar="K", help="Rows of the level table; sampler.count too. [default: 32]")
+    ] = None,
+    limits: Annotated[
+        tuple[float, float] | None,
+        typer.Option("--range", metavar="LO HI", help="Isovalues to sweep. [default: from the data, as info suggests]"),
+    ] = None,
+    inside: Annotated[
+        str | None, typer.Option(help="Which side of the isovalue is solid: above, below. [default: above]")
+    ] = None,
+    backend: Annotated[str, typer.Option(help="Light transport: auto, numba, reference.")] = "auto",
+    paths: Annotated[
+        int | None, typer.Option(min=1, metavar="N", help="Light paths from every query. [default: 64]")
+    ] = None,
+    bounces: Annotated[
+        int | None,
+        typer.Option(
+            min=0,
+            metavar="N",
+            help="Reflections. [default: 4 under an open sky; in a closed scene until under 1 % is left out]",
+        ),
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, max=2**64 - 1, metavar="N", help="Equal seeds give equal light.")] = 0,
+    interpolator: Annotated[str, typer.Option(help="From samples to nodes: nearest.")] = "nearest",
+    grid: Annotated[
+        int | None,
+        typer.Option(min=2, metavar="N", help="Nodes along the longest axis. [default: as voxels, at most 128]"),
+    ] = None,
+    surroundings: Annotated[
+        str | None,
+        typer.Option("--scene", help="What is around a volume: sky, floor (and sky), box (and lamp). [default: sky]"),
+    ] = None,
+    albedo: Annotated[
+        tuple[float, float, float] | None,
+        typer.Option(metavar="R G B", help="Share of light that the surface reflects. [default: 0.8 0.8 0.8]"),
+    ] = None,
+    settings: Annotated[
+        list[str] | None, typer.Option("--set", metavar="STAGE.OPTION=VALUE", help="Any option of a stage, repeatable.")
+    ] = None,
+    smooth: Annotated[
+        float | None, typer.Option(min=0.0, metavar="SIGMA", help="Gaussian blur in voxels before anything else.")
+    ] = None,
+    threads: Annotated[int | None, typer.Option(min=1, metavar="N", help="Threads. [default: one a processor]")] = None,
+    no_preview: Annotated[bool, typer.Option("--no-preview", help="Leave the picture out.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a finished run in DIR.")] = False,
+) -> None:
+    """Light a volume, the volumes of a scene file, or a built-in scene, for all isovalues at once.
+
+    DIR then holds illumination.exr, run.json and preview.png, and needs nothing else.
+    """
+    begun = time.perf_counter()
+    from illumgrid import registry, store
+    from illumgrid.illumination import run as light_up
+
+    options = _stage_options(settings or [])
+    if threads is not None and "threads" in registry.option_names("backend", backend):
+        options["backend"].setdefault("threads", str(threads))
+    if isovalues is not None and "count" in registry.option_names("sampler", sampler):
+        options["sampler"].setdefault("count", str(isovalues))
+    stages = {
+        kind: registry.make(kind, name, options[kind])
+        for kind, name in (("sampler", sampler), ("backend", backend), ("interpolator", interpolator))
+    }
+    given = _input(source, surroundings, limits, inside, albedo)
+    if given.preset:
+        grid, paths = grid or given.preset.grid, paths or given.preset.paths
+        isovalues = isovalues or given.preset.isovalues
+    folder = output or Path(f"{given.name}-light")
+    with heard() as sentences:
+        store.claim(folder, overwrite)
+        scene = given.make(smooth or 0.0)
+        for field in scene.fields:
+            shape = " x ".join(map(str, field.volume.shape))
+            say(f"{field.name}: {shape} voxels, isovalues {field.range[0]:.4g} to {field.range[1]:.4g}")
+        with told_progress() as progress:
+            light = light_up(
+                scene, **stages, grid=grid, paths=paths or 64, bounces=bounces, isovalues=isovalues, seed=seed,
+                progress=progress,
+            )  # fmt: skip
+    recipe = {**light.recipe, "input": source or given.name, "smooth": smooth or 0.0, "warnings": sentences}
+    replace(light, recipe=recipe).save(folder, preview=not no_preview, overwrite=overwrite)
+    _told_result(light, folder, time.perf_counter() - begun, picture=not no_preview)
+
+
+def _told_result(light: "Illumination", folder: Path, seconds: float, picture: bool) -> None:
+    recipe = light.recipe
+    errors = [e for e in recipe["relative_error"] if e is not None]
+    noise = f", noise about {max(errors):.1%} of the mean light" if errors else ""
+    say(f"{recipe['queries']} queries x {recipe['paths']} paths in {seconds:.1f} s{noise}{told_left_out(recipe)}")
+    say(f"wrote {folder}" + (f"; look at {folder / 'preview.png'}" if picture else ""))
