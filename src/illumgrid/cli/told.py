@@ -56,6 +56,7 @@ def told_progress() -> Iterator["Progress"]:
 
 
 def told_left_out(recipe: Mapping[str, Any]) -> str:
+    """What the bounces left out would add, as the end of a sentence; empty where nobody estimated it."""
     left = recipe.get("left_out")
     if left is None:
         return ""
