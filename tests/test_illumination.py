@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 import illumgrid as ig
-from illumgrid import preview, registry
+from illumgrid import preview
 from illumgrid.tone import encode_srgb
 from shapes import ball, lit, refused, sky
 
@@ -158,13 +158,6 @@ def test_stage_objects_serve_as_well_as_names(light):
     stages = {kind: getattr(ig, kind)(name) for kind, name in names.items()}
     again = ig.run(light.scene, **stages, **QUICK)
     assert np.array_equal(again.grids[0].values, light.grids[0].values)
-
-
-def test_options_that_are_true_or_false_are_read_as_such():
-    assert registry._parse("x.y", "True", bool) is True and registry._parse("x.y", "false", bool) is False
-    refused(lambda: registry._parse("x.y", "maybe", bool), "x.y", "'maybe'", "true or false")
-    assert registry._parse("x.y", "1e-3", float) == 1e-3
-    refused(lambda: registry._parse("x.y", "much", float), "'much'", "a number")
 
 
 def test_a_sampler_without_a_question_makes_a_grid_of_holes():

@@ -1,12 +1,18 @@
 """The three stages that can be exchanged, and all that their authors need.
 
-A stage is a frozen dataclass with a class attribute ``name``; its fields are its options.
+A stage is a frozen dataclass with a class attribute ``name``; its fields are its options, each with a default, of type
+bool, int, float, str, a ``Literal`` of words, or a tuple of numbers. It may have a class method ``available``, which
+returns None where the stage can run, and else what would make it so, such as ``"pip install embreex"``.
+
+A package brings stages by hooks, functions marked with `hookimpl`, in a module that its entry point of the group
+``illumgrid`` names.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
 from typing import ClassVar, Literal, Protocol, runtime_checkable
 
 import numpy as np
+import pluggy
 from numpy.typing import ArrayLike
 
 from illumgrid.errors import BadInput
@@ -15,7 +21,22 @@ from illumgrid.levelset import isosurface
 from illumgrid.samples import Queries, Samples
 from illumgrid.scene import Scene
 
-__all__ = ["Backend", "GridSpec", "IlluminationGrid", "Interpolator", "Queries", "Sampler", "Samples", "on_level_sets"]
+__all__ = [
+    "Backend",
+    "GridSpec",
+    "IlluminationGrid",
+    "Interpolator",
+    "Queries",
+    "Sampler",
+    "Samples",
+    "hookimpl",
+    "on_level_sets",
+]
+
+hookimpl = pluggy.HookimplMarker("illumgrid")
+"""Marks a function as one of the hooks below; the function's name says which."""
+
+_hookspec = pluggy.HookspecMarker("illumgrid")
 
 
 @runtime_checkable
@@ -39,7 +60,11 @@ class Sampler(Protocol):
 
 @runtime_checkable
 class Backend(Protocol):
-    """Light transport: answers the questions."""
+    """Light transport: answers the questions.
+
+    A backend that answers with something other than light, such as a share of the sky that is not hidden, says so by a
+    class attribute ``transport = False``: closed forms of light are then no measure of it.
+    """
 
     name: ClassVar[str]
     geometry: ClassVar[Literal["mesh", "levelset", "both"]]
@@ -78,6 +103,21 @@ class Interpolator(Protocol):
         spec : GridSpec
         field : int
         """
+
+
+@_hookspec
+def register_samplers() -> Sequence[type[Sampler]]:  # type: ignore[empty-body]
+    """Sampler classes of a package."""
+
+
+@_hookspec
+def register_backends() -> Sequence[type[Backend]]:  # type: ignore[empty-body]
+    """Backend classes of a package."""
+
+
+@_hookspec
+def register_interpolators() -> Sequence[type[Interpolator]]:  # type: ignore[empty-body]
+    """Interpolator classes of a package."""
 
 
 def on_level_sets(

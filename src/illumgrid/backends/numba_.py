@@ -11,6 +11,7 @@ from illumgrid.errors import BadInput
 from illumgrid.levelset import in_frame, marchable
 from illumgrid.samples import Queries, Samples, check_request
 from illumgrid.scene import Scene
+from illumgrid.stages import Backend, hookimpl
 
 
 def cores() -> int:
@@ -73,3 +74,9 @@ class Numba:
         finally:
             pool.shutdown(cancel_futures=True)  # on Ctrl-C the chunks that wait are dropped
         return answer
+
+
+@hookimpl
+def register_backends() -> list[type[Backend]]:
+    """Name this file's stage to the registry, as a plugin does."""
+    return [Numba]

@@ -15,6 +15,7 @@ from illumgrid.levelset import Marchable, in_frame, marchable
 from illumgrid.rng import draw, draw_pair, net_size, partner, stream
 from illumgrid.samples import Queries, Samples, check_request
 from illumgrid.scene import Scene
+from illumgrid.stages import Backend, hookimpl
 from illumgrid.volume import ON_A_VOXEL, Floats
 
 Bools = NDArray[np.bool_]
@@ -364,3 +365,9 @@ class Reference:
         count = np.where(good, len(paths), 0).astype(np.int32)
         m2 *= (len(paths) - 1) / max(paired, 1)
         return Samples(queries, mean.astype(np.float32), m2.astype(np.float32), count)
+
+
+@hookimpl
+def register_backends() -> list[type[Backend]]:
+    """Name this file's stage to the registry, as a plugin does."""
+    return [Reference]

@@ -98,6 +98,18 @@ def _stage_options(settings: list[str]) -> dict[str, dict[str, str]]:
     return options
 
 
+def _stages(names: dict[str, str], settings: list[str], run_wide: dict[str, int | None]) -> dict[str, Any]:
+    """Stages by name; an option given for the whole run goes to the stage that has it, unless --set says otherwise."""
+    from illumgrid import registry
+
+    options = _stage_options(settings)
+    for place, value in run_wide.items():
+        kind, option = place.split(".")
+        if value is not None and option in registry.option_names(kind, names[kind]):
+            options[kind].setdefault(option, str(value))
+    return {kind: registry.make(kind, name, options[kind]) for kind, name in names.items()}
+
+
 def run(
     source: Annotated[
         str | None,
@@ -161,24 +173,17 @@ def run(
     DIR then holds illumination.exr, run.json and preview.png, and needs nothing else.
     """
     begun = time.perf_counter()
-    from illumgrid import registry, store
+    from illumgrid import store
     from illumgrid.illumination import run as light_up
 
-    options = _stage_options(settings or [])
-    if threads is not None and "threads" in registry.option_names("backend", backend):
-        options["backend"].setdefault("threads", str(threads))
-    if isovalues is not None and "count" in registry.option_names("sampler", sampler):
-        options["sampler"].setdefault("count", str(isovalues))
-    stages = {
-        kind: registry.make(kind, name, options[kind])
-        for kind, name in (("sampler", sampler), ("backend", backend), ("interpolator", interpolator))
-    }
-    given = _input(source, surroundings, limits, inside, albedo)
-    if given.preset:
-        grid, paths = grid or given.preset.grid, paths or given.preset.paths
-        isovalues = isovalues or given.preset.isovalues
-    folder = output or Path(f"{given.name}-light")
     with heard() as sentences:
+        names = {"sampler": sampler, "backend": backend, "interpolator": interpolator}
+        stages = _stages(names, settings or [], {"backend.threads": threads, "sampler.count": isovalues})
+        given = _input(source, surroundings, limits, inside, albedo)
+        if given.preset:
+            grid, paths = grid or given.preset.grid, paths or given.preset.paths
+            isovalues = isovalues or given.preset.isovalues
+        folder = output or Path(f"{given.name}-light")
         store.claim(folder, overwrite)
         scene = given.make(smooth or 0.0)
         for field in scene.fields:

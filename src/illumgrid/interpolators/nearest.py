@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from illumgrid.grid import GridSpec, IlluminationGrid, fill_holes
 from illumgrid.samples import Samples
+from illumgrid.stages import Interpolator, hookimpl
 from illumgrid.volume import Floats, world_to_index
 
 _SLAB = 1 << 18  # nodes asked at once: bounds the memory of a search
@@ -59,3 +60,9 @@ class Nearest:
         return IlluminationGrid(
             spec, fill_holes(spec.spacing, values.reshape(*shape, 3), support), error.reshape(shape), support
         )
+
+
+@hookimpl
+def register_interpolators() -> list[type[Interpolator]]:
+    """Name this file's stage to the registry, as a plugin does."""
+    return [Nearest]

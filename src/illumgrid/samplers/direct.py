@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from illumgrid.grid import GridSpec
 from illumgrid.samples import Queries
 from illumgrid.scene import Field, Scene
+from illumgrid.stages import Sampler, hookimpl
 from illumgrid.volume import interpolate, world_to_index
 
 _BATCH = 1 << 14
@@ -74,3 +75,9 @@ class Direct:
                     asked.level,
                     asked.target,
                 )
+
+
+@hookimpl
+def register_samplers() -> list[type[Sampler]]:
+    """Name this file's stage to the registry, as a plugin does."""
+    return [Direct]

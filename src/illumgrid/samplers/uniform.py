@@ -8,7 +8,7 @@ from illumgrid.errors import BadInput
 from illumgrid.grid import GridSpec
 from illumgrid.samples import Queries
 from illumgrid.scene import Scene, level_table
-from illumgrid.stages import on_level_sets
+from illumgrid.stages import Sampler, hookimpl, on_level_sets
 
 
 @dataclass(frozen=True)
@@ -39,3 +39,9 @@ class Uniform:
         """Ask on `count` rows of the common sweep: see `illumgrid.stages.Sampler`."""
         rows = level_table(scene, self.count).table
         yield from on_level_sets(scene, rows, seed, specs=specs, points=self.points or None)
+
+
+@hookimpl
+def register_samplers() -> list[type[Sampler]]:
+    """Name this file's stage to the registry, as a plugin does."""
+    return [Uniform]
