@@ -4,7 +4,6 @@ It takes long to import: import this module only where it is needed.
 """
 
 import math
-import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,7 +12,7 @@ from typing import Any
 import numpy as np
 import SimpleITK as sitk  # noqa: N813  (its usual name)
 
-from illumgrid.errors import BadInput, IllumgridWarning
+from illumgrid.errors import BadInput, tell
 from illumgrid.readers.sizes import CHUNK, DEFLATE, check_axes, check_size, check_tiff, check_words, on_disk
 from illumgrid.volume import Volume
 
@@ -117,4 +116,4 @@ def _warn_of_damaged(folder: Path, used: set[str]) -> None:
 
 
 def _warn(message: str) -> None:
-    warnings.warn(message, IllumgridWarning, stacklevel=4)
+    tell("dicom", message, stacklevel=4)
