@@ -21,9 +21,7 @@ _SIDE = 64  # voxels along the longest axis of the field on which they are count
 
 _ROUGH = 0.5  # normals that turn this much from voxel to voxel are rough (see `turning`)
 _SOOTHED = 0.8  # ... and if a blur by one voxel brings them to this share, it is noise and not shape
-_FLOOR = (
-    0.12  # over turning²: on raw and blurred volumes of ten kinds it held within a factor of two (docs/stability.md)
-)
+_FLOOR = 0.12  # over turning²; within a factor of two on raw and blurred volumes of ten kinds (docs/stability.md)
 _THIN = 0.25  # share of the surface of what is thinner than two nodes
 _FEW = 4  # voxels on the smaller side of a level set that hardly is one
 _TOUCHED = 1e-3  # share of the border's voxels that are solid
@@ -229,8 +227,8 @@ def _thin(field: Field, spec: GridSpec) -> Iterator[Finding]:
         todo = f"--grid {enough} puts a node on every voxel" if longest < enough else "resample the volume finer"
         yield Finding(
             "thin",
-            f"{lost:.0%} of the surface of field {field.name!r} at {middle:.4g} is that of parts thinner than two nodes of "
-            f"a grid of {longest}, so that light of both sides mixes there; {todo}",
+            f"{lost:.0%} of the surface of field {field.name!r} at {middle:.4g} is that of parts thinner than two "
+            f"nodes of a grid of {longest}, so that light of both sides mixes there; {todo}",
         )
 
 
