@@ -120,10 +120,10 @@ def test_what_was_noted_during_a_run_is_kept_and_shown_again(call, tmp_path):
     values = ball(10).values.copy()
     values[0, 0, 0] = np.nan
     np.save(tmp_path / "nan.npy", values)
-    assert "note: 1 of 1000 voxels" in call("run", "nan.npy", *RANGE, *QUICK, "--no-preview", "-o", "out")
+    assert "note: finite: 1 of 1000 voxels" in call("run", "nan.npy", *RANGE, *QUICK, "--no-preview", "-o", "out")
     assert "1 of 1000 voxels" in recipe(tmp_path / "out")["warnings"][0]
-    assert "note: 1 of 1000 voxels" in call("info", "out")
-    assert "note: 1 of 1000 voxels" in call("info", "nan.npy")
+    assert "note: finite: 1 of 1000 voxels" in call("info", "out")
+    assert "note: finite: 1 of 1000 voxels" in call("info", "nan.npy")
 
 
 # Refusals

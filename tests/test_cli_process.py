@@ -56,7 +56,8 @@ sys.exit(f"loaded {heavy}" if heavy else 0)
 
 
 def test_ctrl_c_stops_with_a_sentence_and_leaves_nothing(folder):
-    with start("run", "v.npy", "--paths", "50000", "-o", "out", cwd=folder, said=subprocess.PIPE) as process:
+    args = ("run", "v.npy", "--range", "0.3", "0.9", "--paths", "50000", "-o", "out")
+    with start(*args, cwd=folder, said=subprocess.PIPE) as process:
         try:
             while "voxels" not in process.stderr.readline():
                 assert process.poll() is None

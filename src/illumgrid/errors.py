@@ -1,9 +1,37 @@
 """What went wrong, said in one sentence: what came, what was expected, what to do."""
 
+import warnings
+
 
 class BadInput(ValueError):
     """The caller's input cannot be used; the message says what came, what was expected and what to do."""
 
 
 class IllumgridWarning(UserWarning):
-    """The result stands, but it is worth knowing this about it."""
+    """The result stands, but it is worth knowing this about it.
+
+    The message begins with the warning's name and a colon: ``warnings.filterwarnings("ignore", "plateau:")`` switches
+    one off by name, as ``--ignore plateau`` does on the command line.
+    """
+
+
+WARNINGS = {
+    "finite": "voxels that are NaN or infinite were replaced",
+    "dicom": "a DICOM series with slices that are missing, unreadable or unevenly spaced",
+    "plugin": "a plugin that does not load, or two that claim one name",
+    "plateau": "the range holds a value on which the field is flat",
+    "noise": "normals that turn from voxel to voxel, and that a blur would calm",
+    "thin": "parts of the solid thinner than two nodes of the grid",
+    "border": "a solid that reaches the border of the volume",
+    "empty": "isovalues of the range that have no surface",
+    "anisotropy": "voxels much longer along one axis than along another",
+    "range": "a range that goes beyond the data",
+    "holes": "nodes within the range that got no light of their own",
+}
+"""Names of all warnings, and what each is about."""
+
+
+def tell(name: str, sentence: str, stacklevel: int = 1) -> None:
+    """Warn under one of the names in `WARNINGS`; `stacklevel` counts from the caller."""
+    assert name in WARNINGS
+    warnings.warn(f"{name}: {sentence}", IllumgridWarning, stacklevel=stacklevel + 1)

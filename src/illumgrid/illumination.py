@@ -1,7 +1,6 @@
 """The result, and the way to it: where names of stages become objects."""
 
 import os
-import warnings
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from functools import cached_property
@@ -13,10 +12,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from illumgrid import preview, registry, store, tone
 from illumgrid.bake import Map, Progress, bake, enough_bounces, light_left_out
-from illumgrid.errors import BadInput, IllumgridWarning
+from illumgrid.errors import BadInput, tell
 from illumgrid.grid import GridSpec, IlluminationGrid, WallTexture
 from illumgrid.scene import Levels, Scene, level_table
 from illumgrid.stages import Backend, Interpolator, Sampler
+from illumgrid.volume import Volume
 
 LONGEST = 128
 """Nodes along the longest axis, at most, when nothing else is asked for."""
@@ -103,6 +103,11 @@ def load(folder: str | os.PathLike[str]) -> Illumination:
     return Illumination(stored.scene, stored.levels, stored.grids, stored.walls, stored.recipe)
 
 
+def nodes_over(volume: Volume, longest: int | None = None) -> GridSpec:
+    """Nodes of a volume's grid; by default as many along the longest axis as voxels, at most `LONGEST`."""
+    return GridSpec.over(volume, min(max(volume.shape), LONGEST) if longest is None else longest)
+
+
 def _stage(kind: str, given: Any, options: dict[str, Any] | None = None) -> Any:
     return registry.make(kind, given, options or {}) if isinstance(given, str) else given
 
@@ -173,7 +178,7 @@ def run(
     if isovalues is not None and isinstance(sampler, str) and "count" in registry.option_names("sampler", sampler):
         options["count"] = isovalues
     chosen = _stage("sampler", sampler, options), _stage("backend", backend), _stage("interpolator", interpolator)
-    specs = [GridSpec.over(f.volume, min(max(f.volume.shape), LONGEST) if grid is None else grid) for f in scene.fields]
+    specs = [nodes_over(field.volume, grid) for field in scene.fields]
     if bounces is None:
         bounces, left_out = enough_bounces(scene, chosen[1], seed)
     else:
@@ -183,10 +188,10 @@ def run(
     )
     for field, holes in zip(scene.fields, baked.holes):
         if holes:
-            warnings.warn(
+            tell(
+                "holes",
                 f"{holes} nodes within the range of field {field.name!r} got no light of their own (no normal, or no "
                 "sample in reach); they show that of the nearest node",
-                IllumgridWarning,
                 stacklevel=2,
             )
     recipe = {

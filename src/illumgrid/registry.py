@@ -8,7 +8,6 @@ import importlib
 import inspect
 import os
 import re
-import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import MISSING, dataclass, fields, is_dataclass
 from functools import cache
@@ -18,7 +17,7 @@ from typing import Any, NamedTuple, cast, get_type_hints
 import pluggy
 
 from illumgrid import options, stages
-from illumgrid.errors import BadInput, IllumgridWarning
+from illumgrid.errors import BadInput, tell
 from illumgrid.stages import Backend, Interpolator, Sampler
 
 OWN = (
@@ -226,7 +225,7 @@ def entries() -> tuple[Entry, ...]:
     for fault in found.faults:
         if fault not in _told_of:
             _told_of.add(fault)
-            warnings.warn(fault, IllumgridWarning, stacklevel=2)
+            tell("plugin", fault, stacklevel=2)
     return found.entries
 
 

@@ -3,14 +3,13 @@
 Between its voxels a volume is trilinear. Every level set in this package is one of the trilinear interpolant.
 """
 
-import warnings
 from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from illumgrid.errors import BadInput, IllumgridWarning
+from illumgrid.errors import BadInput, tell
 
 Floats = NDArray[np.float64]
 Side = Literal["above", "below"]
@@ -143,10 +142,10 @@ def finite(volume: Volume, inside: Side) -> Volume:
     outermost = low if inside == "above" else high
     bad = int(good.size - good.sum())
     where = np.unravel_index(int(np.argmin(good)), volume.shape)
-    warnings.warn(
+    tell(
+        "finite",
         f"{bad} of {good.size} voxels are not finite (the first at {tuple(map(int, where))}): NaN became "
         f"{outermost:g}, the value farthest outside, infinities became {low:g} and {high:g}",
-        IllumgridWarning,
         stacklevel=2,
     )
     return volume.with_values(np.nan_to_num(volume.values, nan=outermost, posinf=high, neginf=low))

@@ -4,12 +4,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from illumgrid.cli.told import heard, told_left_out
+from illumgrid.cli.told import Ignore, heard, told_left_out
 
 if TYPE_CHECKING:
     from illumgrid.grid import WallTexture
     from illumgrid.scene import Quad
-    from illumgrid.volume import Volume
+    from illumgrid.volume import Side, Volume
 
 BLOCKS = " ▁▂▃▄▅▆▇█"
 
@@ -28,26 +28,51 @@ def info(
     source: Annotated[
         str, typer.Argument(metavar="DIR|VOLUME", help="A finished run, a volume file or a DICOM folder.")
     ],
+    limits: Annotated[
+        tuple[float, float] | None,
+        typer.Option("--range", metavar="LO HI", help="Isovalues that a sweep is meant for. [default: as suggested]"),
+    ] = None,
+    inside: Annotated[
+        str | None, typer.Option(help="Which side of the isovalue is solid: above, below. [default: above]")
+    ] = None,
+    ignore: Ignore = None,
 ) -> None:
-    """Tell what is inside a volume or a finished run."""
+    """Tell what is inside a volume or a finished run, and what of a volume will make trouble."""
     from illumgrid import store
+    from illumgrid.errors import BadInput
 
-    with heard():
-        if store.is_run(source):
-            _told_run(source)
+    if inside not in (None, "above", "below"):
+        raise BadInput(f"--inside is {inside!r}; expected above or below")
+    with heard(ignore):
+        if not store.is_run(source):
+            _told_volume(source, limits, "below" if inside == "below" else "above")
+        elif limits or inside:
+            raise BadInput(f"{source} is a finished run, which has its range and side; leave --range and --inside out")
         else:
-            _told_volume(source)
+            _told_run(source)
 
 
-def _told_volume(source: str) -> None:
+def _told_volume(source: str, limits: tuple[float, float] | None, inside: "Side") -> None:
+    from illumgrid.diagnosis import critical_isovalues, diagnose, plateaus
+    from illumgrid.errors import tell
+    from illumgrid.illumination import nodes_over
     from illumgrid.readers import read_volume, volume_name
-    from illumgrid.scene import suggest_range
+    from illumgrid.scene import Field, suggest_range
     from illumgrid.volume import finite
 
-    volume = finite(read_volume(source), "above")
+    volume = finite(read_volume(source), inside)
     _told_lattice(volume_name(source), volume)
-    low, high, why = suggest_range(volume)
+    low, high, why = suggest_range(volume, inside)
     typer.echo(f"  suggested range  {low:.4g} to {high:.4g}: {why}")
+    field = Field(volume_name(source), volume, range=(low, high) if limits is None else limits, inside=inside)  # type: ignore[arg-type]
+    if flat := plateaus(volume):
+        flat.sort(key=lambda one: -one[1])
+        values = ", ".join(f"{value:.6g} ({share:.1%} of the cells)" for value, share, _ in flat[:6])
+        typer.echo(f"  plateaus         {values}{f', and {len(flat) - 6} more' if len(flat) > 6 else ''}")
+    for at, what in critical_isovalues(field):
+        typer.echo(f"  critical         {at:.4g}: {what}")
+    for finding in diagnose(field, nodes_over(volume)):
+        tell(finding.name, finding.sentence)
 
 
 def three(numbers: Any) -> str:

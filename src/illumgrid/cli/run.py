@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from illumgrid.cli.told import heard, say, told_left_out, told_progress
-from illumgrid.errors import BadInput
+from illumgrid.cli.told import Ignore, heard, say, told_left_out, told_progress
+from illumgrid.errors import BadInput, tell
 
 if TYPE_CHECKING:
     from illumgrid.demo import Preset
@@ -167,6 +167,7 @@ def run(
     threads: Annotated[int | None, typer.Option(min=1, metavar="N", help="Threads. [default: one a processor]")] = None,
     no_preview: Annotated[bool, typer.Option("--no-preview", help="Leave the picture out.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a finished run in DIR.")] = False,
+    ignore: Ignore = None,
 ) -> None:
     """Light a volume, the volumes of a scene file, or a built-in scene, for all isovalues at once.
 
@@ -174,9 +175,11 @@ def run(
     """
     begun = time.perf_counter()
     from illumgrid import store
+    from illumgrid.diagnosis import diagnose
+    from illumgrid.illumination import nodes_over
     from illumgrid.illumination import run as light_up
 
-    with heard() as sentences:
+    with heard(ignore) as sentences:
         names = {"sampler": sampler, "backend": backend, "interpolator": interpolator}
         stages = _stages(names, settings or [], {"backend.threads": threads, "sampler.count": isovalues})
         given = _input(source, surroundings, limits, inside, albedo)
@@ -189,6 +192,8 @@ def run(
         for field in scene.fields:
             shape = " x ".join(map(str, field.volume.shape))
             say(f"{field.name}: {shape} voxels, isovalues {field.range[0]:.4g} to {field.range[1]:.4g}")
+            for finding in diagnose(field, nodes_over(field.volume, grid)):
+                tell(finding.name, finding.sentence)
         with told_progress() as progress:
             light = light_up(
                 scene, **stages, grid=grid, paths=paths or 64, bounces=bounces, isovalues=isovalues, seed=seed,

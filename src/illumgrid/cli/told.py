@@ -1,13 +1,13 @@
 """What every command says, and how: one line to the user, warnings as they come, bars with the time left."""
 
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from illumgrid.errors import IllumgridWarning
+from illumgrid.errors import WARNINGS, BadInput, IllumgridWarning
 
 if TYPE_CHECKING:
     from illumgrid.bake import Progress
@@ -18,13 +18,22 @@ def say(text: str) -> None:
     typer.echo(text, err=True)
 
 
+Ignore = Annotated[
+    list[str] | None,
+    typer.Option("--ignore", metavar="NAME", help="Warning not to be told, such as noise; repeatable."),
+]
+
+
 @contextmanager
-def heard() -> Iterator[list[str]]:
-    """Collect the package's warnings as sentences, and say each when it is heard."""
+def heard(ignored: Sequence[str] | None = None) -> Iterator[list[str]]:
+    """Collect the package's warnings as sentences, and say each, but for those with `ignored` names."""
+    for name in ignored or ():
+        if name not in WARNINGS:
+            raise BadInput(f"--ignore got {name!r}; expected the name of a warning: {', '.join(WARNINGS)}")
     sentences: list[str] = []
 
     def show(message: Warning | str, category: type[Warning], *rest: Any) -> None:
-        if issubclass(category, IllumgridWarning):
+        if issubclass(category, IllumgridWarning) and str(message).partition(":")[0] not in (ignored or ()):
             sentences.append(str(message))
             say(f"note: {message}")
 
@@ -62,4 +71,3 @@ def told_left_out(recipe: Mapping[str, Any]) -> str:
         return ""
     share = f"about {left:.1%}" if left >= 0.0005 else "less than 0.1%"
     return f", bounces beyond {recipe['bounces']} would add {share}"
-

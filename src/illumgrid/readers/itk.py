@@ -4,7 +4,6 @@ It takes long to import: import this module only where it is needed.
 """
 
 import math
-import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,7 +12,8 @@ from typing import Any
 import numpy as np
 import SimpleITK as sitk  # noqa: N813  (its usual name)
 
-from illumgrid.errors import BadInput, IllumgridWarning
+from illumgrid.errors import BadInput, tell
+from illumgrid.readers.heads import check_head
 from illumgrid.readers.sizes import CHUNK, DEFLATE, check_axes, check_size, check_tiff, check_words, on_disk
 from illumgrid.volume import Volume
 
@@ -88,6 +88,7 @@ def _open(file: str) -> Any:
 
 def _header(file: Path) -> tuple[Any, int]:
     """SimpleITK's reader after it read the header of a file of real voxels, and their width in bytes."""
+    check_head(file)
     reader = _open(str(file))
     kind = sitk.GetPixelIDValueAsString(reader.GetPixelID())  # "16-bit signed integer", "vector of ..."
     if not kind[0].isdigit():
@@ -117,4 +118,4 @@ def _warn_of_damaged(folder: Path, used: set[str]) -> None:
 
 
 def _warn(message: str) -> None:
-    warnings.warn(message, IllumgridWarning, stacklevel=4)
+    tell("dicom", message, stacklevel=4)

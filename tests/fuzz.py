@@ -1,0 +1,280 @@
+"""Mutated files against everything that reads files: BadInput or a right result, and nothing else.
+
+``python tests/fuzz.py --seconds 1800`` works for half an hour; `test_fuzz.py` for a moment, over the corpus first. What
+is found is kept in `tests/corpus` and is from then on a test.
+"""
+
+import argparse
+import gzip
+import os
+import random
+import resource
+import signal
+import sys
+import tempfile
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import SimpleITK as sitk  # noqa: N813
+
+from illumgrid import store
+from illumgrid.errors import BadInput
+from illumgrid.illumination import Illumination
+from illumgrid.readers import read_scene, read_volume
+from test_store import example
+from test_store_trust import reseal
+from volume_files import values, write, write_series
+
+CORPUS = Path(__file__).with_name("corpus")
+SECONDS = 20
+"""A case that takes longer hangs."""
+ROOM = 1 << 30
+"""Bytes of memory that a case may take beyond what the process has: the files are a few kilobytes."""
+
+
+@dataclass(frozen=True)
+class Target:
+    """What is fuzzed: a file of a few kilobytes among others in a folder, and who reads it."""
+
+    name: str
+    make: Callable[[Path], Path]
+    read: Callable[[Path], object]
+
+
+def _volume(ending: str) -> Target:
+    def make(folder: Path) -> Path:
+        file = folder / f"a.{ending}"
+        plain = ending.removesuffix(".gz")
+        if plain == "npy":
+            np.save(folder / "a.npy", values())
+        elif plain == "npz":
+            np.savez_compressed(file, values=values("float32"), spacing=np.ones(3))
+        elif plain == "dcm":
+            write_series(folder / "series", values("int16", (6, 5, 3)))
+            return next(iter(sorted((folder / "series").iterdir())))
+        else:
+            write(folder / f"a.{plain}", values("uint8" if plain == "tif" else "float32"), compress=plain == "nrrd")
+        if plain != ending:
+            file.write_bytes(gzip.compress((folder / f"a.{plain}").read_bytes()))
+        return file
+
+    return Target(ending, make, lambda file: read_volume(file.parent if file.suffix == ".dcm" else file))
+
+
+SCENE = """[[field]]
+name = "a"
+volume = "a.npy"
+albedo = [0.5, 0.5, 0.5]
+range = [20.0, 150.0]
+inside = "above"
+
+[[quad]]
+name = "lamp"
+corner = [0, 0, 9]
+edge_u = [1, 0, 0]
+edge_v = [0, 1, 0]
+albedo = [0, 0, 0]
+emission = [10, 10, 10]
+
+[background]
+radiance = [0.1, 0.1, 0.1]
+"""
+
+
+def _scene(folder: Path) -> Path:
+    np.save(folder / "a.npy", values())
+    (folder / "s.toml").write_text(SCENE)
+    return folder / "s.toml"
+
+
+def _run(part: str, sealed: bool) -> Target:
+    def make(folder: Path) -> Path:
+        store.write(folder / "out", example(), None, False)
+        return folder / "out" / part
+
+    def read(file: Path) -> object:
+        if sealed:  # as somebody would who forges a run
+            try:
+                reseal(file.parent)
+            except (ValueError, TypeError, RecursionError, OSError):
+                return None
+        stored = store.read(file.parent)
+        light = Illumination(stored.scene, stored.levels, stored.grids, stored.walls, stored.recipe)
+        return light.grids[0].lookup(np.zeros((1, 3))), light.exposure
+
+    return Target(f"{'forged ' if sealed else ''}{part}", make, read)
+
+
+TARGETS = (
+    *map(_volume, ("nrrd", "nii", "nii.gz", "mha", "mrc", "vtk", "gipl", "tif", "dcm", "npy", "npz", "npy.gz")),
+    Target("scene", _scene, read_scene),
+    *(_run(part, sealed) for part in (store.RUN, store.EXR) for sealed in (False, True)),
+)
+
+
+def mutate(data: bytes, chance: random.Random) -> bytes:
+    """Flip, cut, repeat, insert, or put a number that lies: mostly near the head, where sizes stand."""
+    result = bytearray(data)
+    for _ in range(chance.choice((1, 1, 1, 2, 4, 16))):
+        if not result:
+            break
+        reach = len(result) if chance.random() < 0.5 else min(len(result), 400)
+        at = chance.randrange(reach)
+        match chance.randrange(7):
+            case 0:
+                result[at] ^= 1 << chance.randrange(8)
+            case 1:
+                result[at] = chance.choice((0, 1, 0x7F, 0x80, 0xFF, ord("9"), ord("-"), ord(" "), ord("\n")))
+            case 2:
+                del result[at:]
+            case 3:
+                del result[at : at + chance.randrange(1, 40)]
+            case 4:
+                result[at:at] = result[at : at + chance.randrange(1, 40)] * chance.choice((1, 2, 50))
+            case 5:
+                lie = chance.choice((2**31 - 1, 2**31, 2**32 - 1, 2**63 - 1, 0, 1, 65535, -1, 10**6))
+                size = chance.choice((2, 4, 8))
+                mask = (1 << 8 * size) - 1
+                result[at : at + size] = (lie & mask).to_bytes(size, chance.choice(("little", "big")))
+            case 6:
+                text = chance.choice(
+                    (b"99999999999", b"-1", b"0", b"1e308", b"nan", b"inf", b"../../a", b"\xff\xfe", b"]")
+                )
+                result[at : at + chance.choice((0, len(text)))] = text
+    return bytes(result)
+
+
+def judge(target: Target, file: Path) -> str:
+    """Empty if the file was read or refused in one sentence; else what happened."""
+    try:
+        target.read(file)
+    except BadInput as error:
+        text = str(error)
+        if "\n" in text or "Traceback" in text:
+            return f"not one sentence: {text[:200]!r}"
+        if "memory" in text or "alloc" in text:
+            return f"more memory than the file explains: {text[:200]!r}"
+    except Exception as error:
+        return f"{type(error).__name__}: {str(error)[:200]}"
+    return ""
+
+
+def _confine() -> None:
+    """Limit the memory of this process, and keep the libraries quiet."""
+    if sys.platform == "linux":
+        used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+        resource.setrlimit(resource.RLIMIT_AS, (used + ROOM, used + ROOM))
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    sitk.ProcessObject.SetGlobalDefaultNumberOfThreads(1)
+    warnings.simplefilter("ignore")
+    null = os.open(os.devnull, os.O_WRONLY)
+    for stream in (1, 2):
+        os.dup2(null, stream)
+    signal.signal(signal.SIGABRT, signal.SIG_DFL)
+
+
+def _child(work: Callable[[int], None]) -> tuple[list[str], int]:
+    """Run `work` in a process of its own, which writes lines into the descriptor that it is given; and how it ended."""
+    read, write_ = os.pipe()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # other threads only wait here
+        child = os.fork()
+    if not child:
+        try:
+            os.close(read)
+            _confine()
+            work(write_)
+            os.write(write_, b"end\n")
+        finally:
+            os._exit(0)
+    os.close(write_)
+    with os.fdopen(read) as said:
+        lines = said.read().splitlines()
+    return lines, os.waitpid(child, 0)[1]
+
+
+def _ended(status: int) -> str:
+    if os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGALRM:
+        return f"hung for {SECONDS} s"
+    return f"the process ended with status {status}"
+
+
+def alone(target: Target, file: Path) -> str:
+    """`judge` in a process of its own."""
+
+    def work(tell: int) -> None:
+        signal.alarm(SECONDS)
+        os.write(tell, f"{judge(target, file)}\n".encode())
+
+    lines, status = _child(work)
+    return lines[0] if lines[-1:] == ["end"] else _ended(status)
+
+
+def batch(target: Target, seed: int, cases: int) -> Iterator[tuple[int, str]]:
+    """Cases that went wrong among `cases` from `seed` on, in a process of its own, with what happened."""
+
+    def work(tell: int) -> None:
+        # The number of each case goes down the pipe before it is tried, and what was wrong after.
+        with tempfile.TemporaryDirectory() as place:
+            file = target.make(Path(place))
+            clean = file.read_bytes()
+            for case in range(seed, seed + cases):
+                os.write(tell, f"{case}\n".encode())
+                file.write_bytes(mutate(clean, random.Random(f"{target.name} {case}")))
+                signal.alarm(SECONDS)
+                if what := judge(target, file):
+                    os.write(tell, f"! {what}\n".encode())
+                signal.alarm(0)
+
+    lines, status = _child(work)
+    at = seed
+    for line in lines:
+        if line.startswith("! "):
+            yield at, line[2:]
+        elif line != "end":
+            at = int(line)
+    if lines[-1:] != ["end"]:
+        yield at, _ended(status)
+        if at + 1 < seed + cases:
+            yield from batch(target, at + 1, seed + cases - at - 1)
+
+
+def keep(target: Target, case: int) -> Path:
+    """Write a case into the corpus."""
+    with tempfile.TemporaryDirectory() as place:
+        file = target.make(Path(place))
+        CORPUS.mkdir(exist_ok=True)
+        kept = CORPUS / f"{target.name.replace(' ', '-')}@{case}"
+        kept.write_bytes(mutate(file.read_bytes(), random.Random(f"{target.name} {case}")))
+    return kept
+
+
+def main() -> None:
+    """Fuzz every target in turn until the time is over."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seconds", type=float, default=60.0)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--only", help="name of a target")
+    asked = parser.parse_args()
+    end, seed, wrong = time.monotonic() + asked.seconds, asked.seed, 0
+    targets = [t for t in TARGETS if asked.only in (None, t.name)]
+    count = dict.fromkeys((t.name for t in targets), 0)
+    while time.monotonic() < end:
+        for target in targets:
+            for case, what in batch(target, seed, 200):
+                wrong += 1
+                print(f"{target.name} case {case}: {what}; kept as {keep(target, case)}", flush=True)  # noqa: T201
+            count[target.name] += 200
+            if time.monotonic() > end:
+                break
+        seed += 200
+    print(f"{wrong} wrong of {sum(count.values())}: {count}")  # noqa: T201
+    sys.exit(wrong > 0)
+
+
+if __name__ == "__main__":
+    main()
