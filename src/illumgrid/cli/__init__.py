@@ -6,6 +6,7 @@ from typing import Annotated, Any
 
 import typer
 
+from illumgrid.cli.export import export
 from illumgrid.cli.info import info
 from illumgrid.cli.preview import preview
 from illumgrid.cli.run import run
@@ -20,7 +21,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
-for command in (run, preview, info, verify):
+for command in (run, preview, export, info, verify):
     app.command()(command)
 
 
