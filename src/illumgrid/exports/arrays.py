@@ -157,5 +157,6 @@ def write_npz(path: Path, points: Points, progress: "Progress") -> None:
     progress("file", 0, 1)
     place: dict[str, Any] = {name: getattr(lattice, name) for name in ("origin", "spacing", "direction")}
     place |= {"albedo": points.albedo, "exposure": np.float64(points.exposure)}
-    np.savez_compressed(path, **(points.arrays | place))
+    with path.open("wb") as file:  # to a name that ends otherwise, as in .NPZ, NumPy adds .npz
+        np.savez_compressed(file, **(points.arrays | place))
     progress("file", 1, 1)
