@@ -1,6 +1,6 @@
 """VTK image data, ``.vti``: what ParaView, PyVista and VTK read.
 
-The file is made here, in sixty lines of XML and zlib: VTK itself would be a dependency of a hundred megabytes, meshio
+The file is made here, in sixty lines of XML and zlib: VTK itself would be a dependency of half a gigabyte, meshio
 does not write image data, and pyevtk knows neither compression nor the direction of the axes.
 """
 
