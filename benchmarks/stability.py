@@ -167,6 +167,15 @@ def draw(measured: dict[str, list[tuple[float, dict[str, float]]]]) -> None:
     figure.savefig(IMAGES / "stability.png", dpi=110)
 
 
+def table(measured: dict[str, list[tuple[float, dict[str, float]]]]) -> str:
+    """The numbers as the page includes them."""
+    lines = ["| parameter | value | " + " | ".join(METHODS) + " |", "|---" * (2 + len(METHODS)) + "|"]
+    for name, points in measured.items():
+        for value, result in points:
+            lines.append(f"| {CURVES[name][0]} | {value:g} | " + " | ".join(f"{result[m]:.3f}" for m in METHODS) + " |")
+    return "\n".join(lines) + "\n"
+
+
 def main() -> None:
     """Measure the curves."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -180,6 +189,7 @@ def main() -> None:
             print(f"{name:11} {value:8g}  " + "  ".join(f"{m} {e:.4f}" for m, e in result.items()), flush=True)
     if asked.only is None:
         (IMAGES / "stability.json").write_text(json.dumps(measured, indent=1))
+        (IMAGES / "stability_table.md").write_text(table(measured))
         draw(measured)
 
 
