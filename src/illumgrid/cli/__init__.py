@@ -7,6 +7,7 @@ from typing import Annotated, Any
 import typer
 
 from illumgrid.cli.info import info
+from illumgrid.cli.plugins import plugins
 from illumgrid.cli.preview import preview
 from illumgrid.cli.run import run
 from illumgrid.cli.told import say
@@ -20,7 +21,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
-for command in (run, preview, info, verify):
+for command in (run, preview, info, plugins, verify):
     app.command()(command)
 
 
