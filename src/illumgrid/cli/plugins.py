@@ -22,14 +22,13 @@ def plugins() -> None:
 
     with heard():
         entries = registry.entries()
-    for kind in registry.KINDS:
-        typer.echo(f"{kind}s (--{kind} NAME)")
+    for number, kind in enumerate(registry.KINDS):
+        typer.echo(f"{chr(10) * bool(number)}{kind}s (--{kind} NAME)")
         for entry in entries:
             if entry.kind == kind:
                 typer.echo("\n".join(_lines(entry)))
         if kind == "backend":
             typer.echo(f"  {'auto':<12} stands for {registry.auto_backend()}")
-        typer.echo("")
 
 
 def _lines(entry: "Entry") -> Iterator[str]:
