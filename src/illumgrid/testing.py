@@ -7,8 +7,8 @@ the tests of a class whose name begins with Test. Each failure is a sentence tha
 import json
 import unittest
 from collections.abc import Sequence
-from dataclasses import FrozenInstanceError, asdict, fields, replace
-from typing import Any, ClassVar
+from dataclasses import asdict, is_dataclass, replace
+from typing import Any, ClassVar, cast
 
 import numpy as np
 
@@ -78,6 +78,8 @@ class _StageTests:
     def test_options_are_the_fields_of_a_frozen_dataclass(self) -> None:
         """Equal options make equal stages, which cannot be changed, and say what they are."""
         stage = self.make()
+        frozen = is_dataclass(stage) and cast(Any, stage).__dataclass_params__.frozen
+        assert frozen, f"{type(stage).__name__} is not a frozen dataclass"
         for option in options(type(stage)):
             assert expected(option.type), f"the option {option.name} is of type {option.type}, which --set cannot read"
             assert option.meaning, f"the docstring says nothing of the option {option.name} under Parameters"
@@ -85,12 +87,6 @@ class _StageTests:
         twin = replace(stage)
         assert stage == twin and hash(stage) == hash(twin), "stages of equal options differ"
         assert json.dumps({"name": stage.name, **asdict(stage)}), "the options are not what a record can hold"
-        for name in [f.name for f in fields(stage)] or ["name"]:
-            try:
-                setattr(stage, name, getattr(stage, name))
-            except FrozenInstanceError:
-                continue
-            raise AssertionError(f"{name} can be changed: the dataclass is not frozen")
 
 
 class SamplerTests(_StageTests):
