@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-QUICK = "--range 0.3 0.9 --grid 8 --paths 2 --bounces 1 --no-preview".split()
+QUICK = ["--range", "0.3", "0.9", "--grid", "8", "--paths", "2", "--bounces", "1", "--no-preview"]
 
 
 @pytest.mark.parametrize("sampler", ["direct", "uniform", "adaptive"])

@@ -13,6 +13,7 @@ from illumgrid.samples import Samples
 from illumgrid.stages import Interpolator, hookimpl
 from illumgrid.volume import Floats
 
+
 def _spline_values(places: Sites, around: Neighbours) -> tuple[Floats, Floats]:
     from illumgrid.interpolators.spline import AMPLIFIES, weigh
 
