@@ -42,7 +42,8 @@ def test_views_show_the_balls_where_they_are_however_the_array_is_stored(axes, f
     assert left["front"][0] > left["top"][0] + 15
     below = places(render(light, view="bottom", **SIZE))
     assert below["front"][1] < below["top"][1] - 15 and below["x"][0] > below["top"][0] + 15
-    assert places(render(light, view="back", **SIZE))["x"][0] < front["top"][0] - 15
+    behind = places(render(light, view="back", **SIZE))
+    assert behind["x"][0] < behind["top"][0] - 15
 
 
 def test_angles_are_those_of_the_names_and_the_picture_is_the_same():
