@@ -43,7 +43,21 @@ def brain(folder):
     return studio(volume, (0.78, 0.6, 0.52), (60, 110)), 160, {"isovalue": 85.0}
 
 
-PICTURES = {"brain": brain}
+def neuron(folder):
+    """A neuron over a floor, under a lamp: shadows say how high each branch runs."""
+    whole = ig.read_volume(folder / "rivulet_neuron.nrrd")  # its middle: two thin arms lead far out
+    volume = smooth(ig.Volume(whole.values[45:195, 80:335, :105], spacing=whole.spacing), 1.0)
+    scene = ig.Scene.floor(volume, albedo=(0.8, 0.62, 0.3), range=(10, 40))
+    floor = replace(scene.quads[0], texels=(160, 160))
+    size = np.abs(floor.edge_u).max()
+    corner = floor.corner + 0.2 * floor.edge_u + 0.7 * floor.edge_v + [0, 0, 0.9 * size]
+    shine = ig.Material(np.zeros(3), np.array([40.0, 38.0, 34.0]))
+    lamp = ig.Quad("lamp", corner, 0.2 * floor.edge_v, 0.2 * floor.edge_u, shine, texels=(1, 1))
+    scene = replace(scene, quads=(floor, lamp), background=np.full(3, 0.35))
+    return scene, 200, {"isovalue": 14.0, "view": (-35.0, 50.0), "zoom": 1.05}
+
+
+PICTURES = {"brain": brain, "neuron": neuron}
 
 
 def main():
