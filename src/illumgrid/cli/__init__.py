@@ -11,6 +11,7 @@ from illumgrid.cli.preview import preview
 from illumgrid.cli.run import run
 from illumgrid.cli.told import say
 from illumgrid.cli.verify import verify
+from illumgrid.cli.view import view
 from illumgrid.errors import BadInput
 
 app = typer.Typer(
@@ -20,7 +21,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
-for command in (run, preview, info, verify):
+for command in (run, preview, view, info, verify):
     app.command()(command)
 
 
