@@ -15,7 +15,7 @@ function bars(counts, from, to, highest) {
   counts.forEach((count, k) => {
     const middle = (k + 0.5) / counts.length;
     if (count && middle >= from && middle <= to) {
-      const height = Math.max(1.5, 100 * Math.sqrt(count / highest)); // roots: a peak of background hides nothing
+      const height = Math.max(1.5, Math.min(100, 100 * Math.sqrt(count / highest))); // a peak of background hides nothing
       path += `M${k} 100V${(100 - height).toFixed(1)}h1V100z`;
     }
   });
@@ -38,14 +38,15 @@ function sweep(field, number, many, put) {
   slider.style.left = `calc(${100 * from}% - 10px)`;
   slider.style.width = `calc(${100 * (to - from)}% + 20px)`;
   const svg = document.createElementNS(SVG, "svg");
-  svg.setAttribute("viewBox", `0 0 ${field.histogram.counts.length} 100`);
+  svg.setAttribute("viewBox", `0 0 ${counts.length} 100`);
   svg.setAttribute("preserveAspectRatio", "none");
   svg.setAttribute("aria-hidden", "true");
-  const highest = Math.max(...field.histogram.counts);
+  const { counts } = field.histogram;
+  const highest = 1.2 * Math.max(1, ...counts.filter((_, k) => (k + 1) / counts.length > from && k / counts.length < to));
   for (const [kind, a, b] of [["", -1, 2], ["baked", from, to]]) {
     const path = document.createElementNS(SVG, "path");
     path.setAttribute("class", kind);
-    path.setAttribute("d", bars(field.histogram.counts, a, b, highest));
+    path.setAttribute("d", bars(counts, a, b, highest));
     svg.append(path);
   }
   const band = element("div", { class: "band" });
