@@ -9,7 +9,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from illumgrid.errors import BadInput
 from illumgrid.preview import gl, meshes, software
-from illumgrid.preview.camera import VIEWS, Camera, View, camera_around, fit_camera, widest_row
+from illumgrid.preview.block import Block
+from illumgrid.preview.camera import VIEWS, Camera, View, camera_around, corners, fit_camera, widest_row
 from illumgrid.preview.shade import BACKGROUND, CAP_TONE, Colors, Shown
 from illumgrid.tone import decode_srgb, encode_srgb
 
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
     from illumgrid.illumination import Illumination
 
 __all__ = [
-    "BACKGROUND", "CAP_TONE", "ENGINES", "VIEWS", "Camera", "camera_around", "choose_engine", "fit_camera", "png",
+    "BACKGROUND", "CAP_TONE", "ENGINES", "VIEWS", "Camera", "choose_engine", "fit_camera", "grid_volume", "png",
     "render", "widest_row",
 ]  # fmt: skip
 
@@ -125,6 +126,35 @@ def _drawn(shown: Shown, camera: Camera, sheet: _Sheet, engine: str) -> Colors:
     if engine == "software":
         return software.draw(shown, camera, *paper)
     return gl.draw(meshes.triangles(shown, camera.eye), camera, *paper, engine)
+
+
+def grid_volume(
+    light: "Illumination",
+    field: str | None = None,
+    *,
+    width: int = 960,
+    height: int = 720,
+    cut: bool = False,
+    view: View = None,
+    zoom: float = 1.0,
+    background: str | None = None,
+    engine: str = "software",
+) -> NDArray[np.uint8]:
+    """Picture (height, width, 3), sRGB, of the illumination grid of a field as a block (Figure 6 of the paper).
+
+    Each point of it has the colour that the level set through that point shows there, at the exposure of all pictures.
+    Parameters are those of `render`; `cut` leaves out the octant towards the eye, so that one looks inside.
+    """
+    drawn_by, _ = choose_engine(engine)
+    sheet = _Sheet(width, height, _background(background))
+    number = 0 if field is None else light.scene.number_of(field)
+    spec = light.grids[number].spec
+    camera = camera_around(corners(spec), spec.direction, width / height, view or (30.0, 24.0), zoom)
+    shown = Shown(light, light.scene.levels(0.5)[0], 0.5, local=False)
+    block, paper = Block(shown, number, camera.eye, cut), (sheet.width, sheet.height, sheet.background)
+    if drawn_by == "software":
+        return encode_srgb(block.draw(camera, *paper))
+    return encode_srgb(gl.draw(block.sheets(), camera, *paper, drawn_by))
 
 
 def _background(color: str | None) -> Colors:
