@@ -21,7 +21,7 @@ def automatic_exposure(radiance: NDArray[np.floating]) -> float:
 def srgb_curve(linear: NDArray[np.floating]) -> NDArray[np.floating]:
     """Sample values of sRGB, 0 to 1, of linear display values, clamped to 0 .. 1 (IEC 61966-2-1)."""
     c = np.clip(linear, 0.0, 1.0)
-    return np.where(c <= 0.0031308, 12.92 * c, 1.055 * np.power(np.maximum(c, 1e-9), 1 / 2.4) - 0.055)
+    return np.asarray(np.where(c <= 0.0031308, 12.92 * c, 1.055 * np.power(np.maximum(c, 1e-9), 1 / 2.4) - 0.055))
 
 
 def encode_srgb(linear: NDArray[np.floating]) -> NDArray[np.uint8]:

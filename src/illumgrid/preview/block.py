@@ -4,8 +4,9 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
-from illumgrid.grid import GridSpec
+from illumgrid.grid import GridSpec, read_lattice
 from illumgrid.preview import software
 from illumgrid.preview.camera import Camera
 from illumgrid.preview.meshes import Colored, squares
@@ -14,6 +15,8 @@ from illumgrid.scene import upright
 from illumgrid.volume import Floats, index_to_world
 
 NEAR = 1e-9  # index units: a ray that comes this close to the corner that was cut out is in it
+FACES = 0.8, 0.9, 1.0  # tones of faces across, along and above the view from the front: unlit, they would run together
+HOLE = 0.3  # tone of a place between holes only: no level set within the range goes there
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,9 +62,18 @@ class Block:
         upper = self.index(self.eye) - self.last / 2 + 1e-6 * self.last * nudge > 0
         return np.where(upper, middle, 0.0), np.where(upper, self.last, middle)
 
-    def color(self, points: Floats) -> Colors:
-        """Display-linear colours (n, 3) of the light at world points, as a surface there would show it."""
-        return self.shown.field(self.number, points, np.zeros(len(points)))
+    @cached_property
+    def tones(self) -> Floats:
+        """Tone (3,) of the faces across each axis."""
+        across = np.abs(self.spec.direction.T @ np.stack(upright(self.spec.direction), axis=1))
+        return np.asarray(across @ [FACES[0], FACES[1], FACES[2]])
+
+    def color(self, points: Floats, axis: NDArray[np.integer]) -> Colors:
+        """Display-linear colours (n, 3) at world points (n, 3) in faces across these axes (n,)."""
+        grid = self.shown.light.grids[self.number]
+        known = read_lattice(self.spec, (grid.support > 0)[..., None].astype(np.float32), points)
+        tone = (HOLE + (1 - HOLE) * known) * self.tones[axis][:, None]
+        return np.asarray(tone * self.shown.field(self.number, points, np.zeros(len(points))), dtype=np.float32)
 
     def draw(self, camera: Camera, width: int, height: int, background: Colors) -> Colors:
         """Display-linear picture (height, width, 3)."""
@@ -69,16 +81,17 @@ class Block:
 
         def seen(directions: Floats) -> Colors:
             slope = directions @ self.spec.direction / self.spec.spacing
-            t, far = _through(start, slope, np.zeros(3), self.last)
+            t, far, axis, _ = _through(start, slope, np.zeros(3), self.last)
             hit = (t < far) & (far > 0)
             if self.cut:
                 low, high = self.octant
                 entry = start + np.where(hit, t, 0.0)[:, None] * slope
                 open_ = hit & ((entry >= low - NEAR) & (entry <= high + NEAR)).all(axis=1)
-                t = np.where(open_, _through(start, slope, low, high)[1], t)
+                _, inner, _, inner_axis = _through(start, slope, low, high)
+                t, axis = np.where(open_, inner, t), np.where(open_, inner_axis, axis)
                 hit &= t < far * (1 - NEAR)
             color = np.tile(background, (len(directions), 1))
-            color[hit] = self.color(camera.eye + t[hit, None] * directions[hit])
+            color[hit] = self.color(camera.eye + t[hit, None] * directions[hit], axis[hit])
             return color
 
         return software.traced(seen, camera, width, height)
@@ -99,13 +112,17 @@ class Block:
                 if plane in (inner[axis], outer[axis]):
                     faces = faces[gone if self.cut and plane == inner[axis] else ~gone]
                 points = index_to_world(self.spec, index)
-                found.append(Colored(points, faces, self.color(points)))
+                found.append(Colored(points, faces, self.color(points, np.full(len(points), axis))))
         return found
 
 
-def _through(start: Floats, slope: Floats, low: Floats, high: Floats) -> tuple[Floats, Floats]:
-    """Where rays (n) from one point enter and leave a box; entered after it is left where they miss it."""
+def _through(
+    start: Floats, slope: Floats, low: Floats, high: Floats
+) -> tuple[Floats, Floats, NDArray[np.integer], NDArray[np.integer]]:
+    """Where rays (n) from one point enter and leave a box, and across which axes; leave comes first where they miss."""
     with np.errstate(divide="ignore", invalid="ignore"):
         one, two = (low - start) / slope, (high - start) / slope
-    # A ray within the plane of a face is 0/0 away from it: that face does not bound it.
-    return np.fmin(one, two).max(axis=1, initial=-np.inf), np.fmax(one, two).min(axis=1, initial=np.inf)
+    # A ray in the plane of a face is 0/0 away from it: that axis does not bound it.
+    enter = np.nan_to_num(np.fmin(one, two), nan=-np.inf, posinf=np.inf, neginf=-np.inf)
+    leave = np.nan_to_num(np.fmax(one, two), nan=np.inf, posinf=np.inf, neginf=-np.inf)
+    return enter.max(axis=1), leave.min(axis=1), enter.argmax(axis=1), leave.argmin(axis=1)

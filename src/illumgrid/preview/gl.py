@@ -18,6 +18,7 @@ from illumgrid.preview.camera import Camera
 from illumgrid.preview.meshes import Colored
 from illumgrid.preview.shade import Colors
 from illumgrid.tone import decode_srgb, srgb_curve
+from illumgrid.volume import Floats
 
 SIDE = 2  # pixels drawn along each side of one: averaged in linear light, as the software engine does
 LARGEST = 16384 // SIDE  # pixels along a side that common drivers can draw
@@ -73,7 +74,7 @@ def _import(platform: str) -> Any:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         if not hasattr(np, "infty"):
-            np.infty = np.inf  # type: ignore[attr-defined]
+            setattr(np, "infty", np.inf)  # noqa: B010  (gone since NumPy 2)
         # pyrender imports its window, pyglet with it, and with that the libraries of a desktop: none of it is needed.
         window: Any = types.ModuleType("pyrender.viewer")
         window.Viewer = None
@@ -132,7 +133,7 @@ def draw(
     return np.asarray(linear.mean(axis=(1, 3)), dtype=np.float32)
 
 
-def _depths(seen: list[Colors]) -> tuple[float, float]:
+def _depths(seen: list[Floats]) -> tuple[float, float]:
     """Distances of the near and the far plane that hold all points in front of the camera."""
     depth = np.concatenate([-p[:, 2] for p in seen]) if seen else np.ones(1)
     far = float(depth.max())

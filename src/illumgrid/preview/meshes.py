@@ -69,7 +69,7 @@ def _solid(shown: Shown, number: int, field: Field, eye: Floats) -> list[Colored
 def squares(nu: int, nv: int) -> NDArray[np.int64]:
     """Triangles (m, 3) that join (nu, nv) points in C order into a sheet."""
     corner = (np.arange(nu - 1)[:, None] * nv + np.arange(nv - 1)).reshape(-1, 1)
-    return (corner + np.array([[0, nv, nv + 1, 0, nv + 1, 1]])).reshape(-1, 3)
+    return np.asarray((corner + np.array([[0, nv, nv + 1, 0, nv + 1, 1]])).reshape(-1, 3))
 
 
 def _wall(shown: Shown, number: int, eye: Floats) -> Colored:

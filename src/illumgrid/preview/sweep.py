@@ -1,9 +1,9 @@
-"""A sweep through the isovalues as a film: every frame at one exposure, by one camera, with its isovalue in a corner."""
+"""A sweep through the isovalues as a film: one exposure, one camera, the isovalue in a corner of each frame."""
 
 import importlib.util
 import io
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,7 +35,7 @@ def isovalues_of(scene: "Scene", row: NDArray[np.float64]) -> str:
     """Isovalues (F,) as a line of text; with names where there are several."""
     if len(row) == 1:
         return f"{row[0]:.4g}"
-    return "   ".join(f"{field.name} {isovalue:.4g}" for field, isovalue in zip(scene.fields, row))
+    return ",  ".join(f"{field.name}: {isovalue:.4g}" for field, isovalue in zip(scene.fields, row))
 
 
 def labelled(picture: Picture, text: str) -> Picture:
@@ -43,7 +43,7 @@ def labelled(picture: Picture, text: str) -> Picture:
     from PIL import Image, ImageDraw, ImageFont
 
     height = picture.shape[0]
-    size = max(10, height // 30)
+    size = max(12, height // 32)
     image = Image.fromarray(picture)
     tone = 225 if picture[-size:, : 4 * size].mean() < 128 else 40
     place = size // 2, height - size // 2
@@ -72,10 +72,11 @@ def film(pictures: list[Picture], ending: str) -> bytes:
         return _mp4(pictures, 1 / stands)
     from PIL import Image
 
-    images = [Image.fromarray(p) for p in pictures]
-    options: dict[str, object] = {"quality": 88, "method": 4}
+    options: dict[str, Any]
     if ending == ".gif":
         images, options = _one_palette(pictures), {"optimize": False, "disposal": 1}
+    else:
+        images, options = [Image.fromarray(p) for p in pictures], {"quality": 88, "method": 4}
     buffer = io.BytesIO()
     images[0].save(
         buffer, ending[1:], save_all=True, append_images=images[1:], duration=round(1000 * stands), loop=0, **options
@@ -83,12 +84,12 @@ def film(pictures: list[Picture], ending: str) -> bytes:
     return buffer.getvalue()
 
 
-def _one_palette(pictures: list[Picture]) -> list[object]:
+def _one_palette(pictures: list[Picture]) -> list[Any]:
     """Reduce to 256 colours that all frames share: a palette for each would flicker."""
     from PIL import Image
 
     some = pictures[:: max(1, len(pictures) // 8)]
-    palette = Image.fromarray(np.concatenate([p[::2, ::2] for p in some])).quantize(256)
+    palette = Image.fromarray(np.concatenate([p[::2, ::2] for p in some])).quantize(256, method=Image.Quantize.FASTOCTREE)
     return [Image.fromarray(p).quantize(palette=palette, dither=Image.Dither.FLOYDSTEINBERG) for p in pictures]
 
 
