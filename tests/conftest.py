@@ -10,7 +10,7 @@ from shapes import ball
 @pytest.fixture
 def call(capsys, tmp_path, monkeypatch):
     """Run a command in a folder of its own, with small pictures; returns what it said."""
-    monkeypatch.setattr(preview.render, "__kwdefaults__", {"width": 64, "height": 48, "local": False})
+    monkeypatch.setattr(preview.render, "__kwdefaults__", {**preview.render.__kwdefaults__, "width": 64, "height": 48})
     monkeypatch.chdir(tmp_path)
     np.save(tmp_path / "v.npy", ball(10).values)
 

@@ -85,7 +85,7 @@ def test_what_is_saved_is_what_is_loaded(light, tmp_path):
 
 
 def test_saving_draws_the_picture_unless_told_not_to_and_replaces_only_when_told_to(light, tmp_path, monkeypatch):
-    monkeypatch.setattr(preview.render, "__kwdefaults__", {"width": 80, "height": 60, "local": False})
+    monkeypatch.setattr(preview.render, "__kwdefaults__", {**preview.render.__kwdefaults__, "width": 80, "height": 60})
     light.save(tmp_path / "out")
     with Image.open(tmp_path / "out" / "preview.png") as picture:
         assert np.array_equal(np.asarray(picture), preview.render(light))

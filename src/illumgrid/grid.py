@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from illumgrid.errors import BadInput
-from illumgrid.volume import Floats, Lattice, index_to_world, placement, world_to_index
+from illumgrid.volume import ON_A_VOXEL, Floats, Lattice, index_to_world, placement
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,13 +123,12 @@ class WallTexture:
 
 def read_lattice(spec: Lattice, values: NDArray[np.float32], points: ArrayLike) -> NDArray[np.float32]:
     """Trilinear `values` (nx, ny, nz, m) at world points (n, 3), clamped to the border: (n, m)."""
-    from scipy.ndimage import map_coordinates
+    from illumgrid.trilinear import read
 
-    world = np.asarray(points, dtype=float).reshape(-1, 3)
-    index = world_to_index(spec, np.nan_to_num(world)).T
+    world = np.ascontiguousarray(points, dtype=float).reshape(-1, 3)
     result = np.zeros((len(world), values.shape[3]), dtype=np.float32)
-    for channel in range(values.shape[3]):
-        map_coordinates(values[..., channel], index, output=result[:, channel], order=1, mode="nearest")
+    place = (np.ascontiguousarray(x, dtype=float) for x in (spec.origin, spec.direction, spec.spacing))
+    read(np.ascontiguousarray(values, np.float32), *place, ON_A_VOXEL, world, result)
     return result
 
 

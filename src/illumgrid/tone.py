@@ -18,8 +18,21 @@ def automatic_exposure(radiance: NDArray[np.floating]) -> float:
     return WHITE / bright if bright > 0 and np.isfinite(bright) else 1.0
 
 
-def encode_srgb(linear: NDArray[np.floating]) -> NDArray[np.uint8]:
-    """Eight-bit sRGB of linear display values, clamped to 0 .. 1 (IEC 61966-2-1)."""
+def srgb_curve(linear: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Sample values of sRGB, 0 to 1, of linear display values, clamped to 0 .. 1 (IEC 61966-2-1)."""
     c = np.clip(linear, 0.0, 1.0)
-    curve = np.where(c <= 0.0031308, 12.92 * c, 1.055 * np.power(np.maximum(c, 1e-9), 1 / 2.4) - 0.055)
-    return np.asarray(np.round(255.0 * curve), dtype=np.uint8)
+    return np.asarray(np.where(c <= 0.0031308, 12.92 * c, 1.055 * np.power(np.maximum(c, 1e-9), 1 / 2.4) - 0.055))
+
+
+def encode_srgb(linear: NDArray[np.floating]) -> NDArray[np.uint8]:
+    """Eight-bit sRGB of linear display values, clamped to 0 .. 1."""
+    return np.asarray(np.round(255.0 * srgb_curve(linear)), dtype=np.uint8)
+
+
+_byte = np.arange(256) / 255
+_LINEAR = np.where(_byte <= 0.04045, _byte / 12.92, ((_byte + 0.055) / 1.055) ** 2.4).astype(np.float32)
+
+
+def decode_srgb(picture: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Linear display values of eight-bit sRGB."""
+    return np.asarray(_LINEAR[picture])

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from illumgrid.grid import GridSpec, IlluminationGrid
 from illumgrid.levelset import turned, upward
-from illumgrid.preview import BACKGROUND, CAP_TONE, HALF_ANGLE, _outline, fit_camera
+from illumgrid.preview.camera import HALF_ANGLE, _outline, fit_camera
+from illumgrid.preview.shade import BACKGROUND, CAP_TONE
 from illumgrid.scene import Field, Scene, upright
 from illumgrid.tone import WHITE, encode_srgb
 from illumgrid.volume import Floats, Lattice, Volume, index_to_world
