@@ -201,6 +201,6 @@ void main() {
     vec3 color;
     if (local) color = uGain * uWhite * uAlbedo / max(most(uAlbedo), 1e-9) * max(-dot(normal, ray), uBothSides ? facing : 0.0);
     else color = uGain * uAlbedo * texture(uLight, texel).rgb;
-    if (uLook == SHINY) color += gloss(normal, ray, local ? vec3(uWhite) : texture(uLight, texel).rgb);
+    if (uLook == SHINY) color = 0.8 * color + gloss(normal, ray, local ? vec3(uWhite) : texture(uLight, texel).rgb);
     draw(color, uLook == TRANSLUCENT ? 1.0 - pow(0.62, 1.0 / max(facing, 0.12)) : 1.0);
 }

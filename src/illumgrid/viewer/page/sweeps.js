@@ -30,7 +30,7 @@ function element(kind, attributes = {}, children = []) {
 }
 
 function sweep(field, number, many, put) {
-  const [low, high] = field.histogram.limits;
+  const { counts, limits: [low, high] } = field.histogram;
   const from = (field.range[0] - low) / (high - low), to = (field.range[1] - low) / (high - low);
   const name = `Isovalue of ${field.name}`;
   const typed = element("input", { type: "number", step: "any", "aria-label": `${name}, typed`, inputmode: "decimal" });
@@ -41,7 +41,6 @@ function sweep(field, number, many, put) {
   svg.setAttribute("viewBox", `0 0 ${counts.length} 100`);
   svg.setAttribute("preserveAspectRatio", "none");
   svg.setAttribute("aria-hidden", "true");
-  const { counts } = field.histogram;
   const highest = 1.2 * Math.max(1, ...counts.filter((_, k) => (k + 1) / counts.length > from && k / counts.length < to));
   for (const [kind, a, b] of [["", -1, 2], ["baked", from, to]]) {
     const path = document.createElementNS(SVG, "path");
