@@ -22,27 +22,31 @@ ARGS = [
     "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-quic", "--no-first-run",
     "--disable-background-networking", "--disable-component-update", "--disable-sync",
 ]  # fmt: skip
-WIDTH, HEIGHT = 160, 120
+WIDTH, HEIGHT = 120, 90
 SMALL = (
     "addEventListener('DOMContentLoaded', () => document.head.insertAdjacentHTML('beforeend', '<style>"
     f".viewer {{ display: block !important }} .stage {{ width: {WIDTH}px; height: {HEIGHT}px }}</style>'))"
 )
 
 
+def waves(*shape):
+    """Smooth colours (*shape, 3), different everywhere and along every axis, from 0.4 to 2.4."""
+    place = np.stack(np.meshgrid(*(np.linspace(0, 1, n) for n in shape), indexing="ij"), axis=-1)
+    slopes = np.array([[4.0, 1.1, -1.7], [-1.3, 3.1, 2.3], [2.1, -2.9, 3.7]])
+    return (1.4 + np.sin(place @ slopes + (0.3, 1.0, 2.0))).astype(np.float32)
+
+
 def coloured(scene, nodes=9, rows=3):
-    """Light that differs everywhere, without a run; one node in the first grid is a hole."""
-    rng = np.random.default_rng(0)
+    """Light that differs everywhere, without a run; a sheet of nodes in the first grid are holes."""
     grids, walls = [], []
     for field in scene.fields:
         spec = GridSpec.over(field.volume, nodes)
-        values = (0.5 + 2 * rng.random((*spec.shape, 3))).astype(np.float32)
-        error = (0.1 * rng.random(spec.shape)).astype(np.float32)
-        grids.append(IlluminationGrid(spec, values, error, np.ones(spec.shape)))
-    middle = tuple(n // 2 for n in grids[0].spec.shape[:2])
-    grids[0].support[middle] = 0
+        values = waves(*spec.shape)
+        grids.append(IlluminationGrid(spec, values, 0.05 * values[..., 0], np.ones(spec.shape)))
+    grids[0].support[grids[0].spec.shape[0] // 2] = 0
     for quad in scene.quads:
         shape = (rows, *quad.texels[::-1])
-        walls.append(WallTexture((0.3 + rng.random((*shape, 3))).astype(np.float32), np.ones(shape)))
+        walls.append(WallTexture(waves(*shape), np.ones(shape)))
     return Illumination(scene, level_table(scene, rows), tuple(grids), tuple(walls), {"seed": 0})
 
 

@@ -17,9 +17,9 @@ def test_the_pixels_are_those_of_the_still_picture(browser, name, t, kind):  # n
     browser.open(light, f"{address}&light={kind}")
     off = np.abs(browser.pixels() - wanted).max(axis=2)
     assert covered.mean() > 0.2
-    # Half floats are good to 0.1 of 255; what is left are pixels on an outline, which the two cut a little differently.
-    assert np.median(off[covered]) <= 1 and np.quantile(off[covered], 0.95) <= 3
-    assert off[~covered].max() <= 1 or np.mean(off[~covered] > 1) < 0.01
+    # Half floats are good to 0.1 of 255; what is left are outlines, which the page samples up to four times as densely.
+    assert np.median(off[covered]) <= 1 and np.quantile(off[covered], 0.9) <= 3
+    assert np.mean(off[~covered] > 3) < 0.02
 
 
 def test_the_page_opens_at_the_middle_with_the_camera_of_the_still_picture(browser):  # noqa: F811
@@ -89,9 +89,9 @@ def test_a_drag_turns_the_object_with_the_hand_and_a_double_click_resets(browser
     page = browser.open(SCENES["pair"])
     before, box = browser.pixels(), page.locator("canvas").bounding_box()
     near = page.evaluate("illumgrid.state.view.azimuth")
-    page.mouse.move(box["x"] + 80, box["y"] + 60)
+    page.mouse.move(box["x"] + 60, box["y"] + 45)
     page.mouse.down()
-    page.mouse.move(box["x"] + 110, box["y"] + 60)
+    page.mouse.move(box["x"] + 90, box["y"] + 45)
     page.mouse.up()
     assert page.evaluate("illumgrid.state.view.azimuth") < near  # the front goes right: the eye goes left
     page.mouse.wheel(0, -200)
@@ -127,7 +127,7 @@ def test_the_trust_view_hatches_holes_and_colours_errors(browser):  # noqa: F811
     assert page.locator('[data-part="legend"]').is_visible()
     on = made[(np.abs(made - made[0, 0]).max(axis=2) > 12)]
     grey = np.ptp(on, axis=1) <= 2
-    assert 0.002 < grey.mean() < 0.6  # the column of holes
+    assert 0.02 < grey.mean() < 0.6  # the sheet of holes
     assert (on[~grey][:, 2] > on[~grey][:, 0]).any() and (on[~grey][:, 2] < on[~grey][:, 0]).any()  # sure, and not
 
 

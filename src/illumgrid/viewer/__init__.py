@@ -33,8 +33,8 @@ def script(last: str) -> str:
 
 
 def shaders() -> dict[str, str]:
-    """The shaders by the names of their files."""
-    return {name: source(name) for name in SHADERS}
+    """The shaders by the names of their files, but for what only a reader needs: inside JSON there is none."""
+    return {name: re.sub(r"^ +|^ *//.*\n", "", source(name), flags=re.MULTILINE) for name in SHADERS}
 
 
 def compressed(data: bytes) -> bytes:

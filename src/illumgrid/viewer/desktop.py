@@ -79,6 +79,7 @@ class Window:
                 culling="back" if number >= len(solids) else None,  # a wall is seen from its front, wherever one goes
             )  # fmt: skip
         self.plotter.reset_camera_clipping_range()
+        self.plotter.render()
 
 
 def show(light: "Illumination") -> None:

@@ -75,7 +75,7 @@ class Bytes:
         return self.length - len(part)
 
 
-def reduced(volume: Volume, most: int = MOST_VOXELS) -> Volume:
+def reduced(volume: Volume, most: int) -> Volume:
     """Means over blocks of voxels, the same number along each axis, until at most `most` remain."""
     factor = 1
     while np.prod([-(-n // factor) for n in volume.shape]) > most:
@@ -152,7 +152,7 @@ def _histogram(field: Field) -> dict[str, Any]:
 
 def _field(light: "Illumination", number: int, stage: Stage, into: Bytes, notes: list[str]) -> dict[str, Any]:
     field, whole, grid = light.scene.fields[number], light.grids[number], _thinned(light.grids[number])
-    volume = reduced(field.volume)
+    volume = reduced(field.volume, MOST_VOXELS)
     sign = float(upward(light.scene)[number])
     ends = sorted(sign * field.range)
     steps, base, step, clamped = field_steps(turned(volume, field.inside)[0], (ends[0], ends[1]))

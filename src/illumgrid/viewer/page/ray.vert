@@ -6,8 +6,8 @@ out vec3 vRay;
 out vec2 vPlace;
 
 void main() {
-    vec2 place = vec2(gl_VertexID == 1 ? 3.0 : -1.0, gl_VertexID == 2 ? 3.0 : -1.0);
-    vRay = uForward + (place.x + uJitter.x) * uRight + (place.y + uJitter.y) * uUp;
-    vPlace = 0.5 * place + 0.5;
-    gl_Position = vec4(place, 0.0, 1.0);
+  vec2 place = vec2(gl_VertexID == 1 ? 3.0 : -1.0, gl_VertexID == 2 ? 3.0 : -1.0);
+  vRay = uForward + (place.x + uJitter.x) * uRight + (place.y + uJitter.y) * uUp;
+  vPlace = 0.5 * place + 0.5;
+  gl_Position = vec4(place, 0.0, 1.0);
 }

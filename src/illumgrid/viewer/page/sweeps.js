@@ -2,8 +2,6 @@
 
 import { isovalueOf, sweepOf } from "./state.js";
 
-const SVG = "http://www.w3.org/2000/svg";
-
 export function said(field, isovalue) {
   const span = field.range[1] - field.range[0];
   const digits = Math.ceil(-Math.log10(span / 400));
@@ -37,20 +35,14 @@ function sweep(field, number, many, put) {
   const slider = element("input", { type: "range", min: field.range[0], max: field.range[1], step: "any", "aria-label": name });
   slider.style.left = `calc(${100 * from}% - 10px)`;
   slider.style.width = `calc(${100 * (to - from)}% + 20px)`;
-  const svg = document.createElementNS(SVG, "svg");
-  svg.setAttribute("viewBox", `0 0 ${counts.length} 100`);
-  svg.setAttribute("preserveAspectRatio", "none");
-  svg.setAttribute("aria-hidden", "true");
   const highest = 1.2 * Math.max(1, ...counts.filter((_, k) => (k + 1) / counts.length > from && k / counts.length < to));
-  for (const [kind, a, b] of [["", -1, 2], ["baked", from, to]]) {
-    const path = document.createElementNS(SVG, "path");
-    path.setAttribute("class", kind);
-    path.setAttribute("d", bars(counts, a, b, highest));
-    svg.append(path);
-  }
+  const drawn = [["", -1, 2], ["baked", from, to]].map(([kind, a, b]) => `<path class="${kind}" d="${bars(counts, a, b, highest)}"/>`);
+  const histogram = element("div", { class: "histogram" });
+  histogram.innerHTML = `<svg viewBox="0 0 ${counts.length} 100" preserveAspectRatio="none" aria-hidden="true">${drawn.join("")}</svg>`;
   const band = element("div", { class: "band" });
   band.style.left = `${100 * from}%`;
   band.style.width = `${100 * (to - from)}%`;
+  histogram.append(band, slider);
   const ends = field.range.map((end, k) => {
     const label = element("span", {}, [said(field, end)]);
     label.style.left = `${100 * (k ? to : from)}%`;
@@ -61,7 +53,7 @@ function sweep(field, number, many, put) {
   const label = element("label", {}, many ? [dot, field.name] : ["Isovalue"]);
   const box = element("div", { class: "sweep", title: `The light was computed for isovalues from ${said(field, field.range[0])} to ${said(field, field.range[1])}` }, [
     element("div", { class: "head" }, [label, typed]),
-    element("div", { class: "histogram" }, [svg, band, slider]),
+    histogram,
     element("div", { class: "limits", "aria-hidden": "true" }, ends),
   ]);
   slider.addEventListener("input", () => put(sweepOf(field, Number(slider.value))));
