@@ -29,6 +29,7 @@ numpydoc_show_class_members = False
 sphinx_gallery_conf = {
     "examples_dirs": "examples",
     "gallery_dirs": "gallery",
+    "ignore_pattern": r"gallery_fields\.py|__init__\.py",
     "abort_on_example_error": True,
     "download_all_examples": False,
     "show_signature": False,

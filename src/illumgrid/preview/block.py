@@ -16,6 +16,7 @@ from illumgrid.volume import Floats, index_to_world
 
 NEAR = 1e-9  # index units: a ray that comes this close to the corner that was cut out is in it
 FACES = 0.8, 0.9, 1.0  # tones of faces across, along and above the view from the front: unlit, they would run together
+STEPS = 256  # squares along a side, at least about: what is bilinear between nodes is then linear to the eye
 HOLE = 0.3  # tone of a place between holes only: no level set within the range goes there
 
 
@@ -99,14 +100,16 @@ class Block:
     def sheets(self) -> list[Colored]:
         """Draw the faces as triangles between the nodes."""
         low, high = self.octant
+        steps = max(1, STEPS // max(self.spec.shape))
         found = []
         for axis in range(3):
             u, v = (k for k in range(3) if k != axis)
             inner, outer = (low, high) if low[axis] > 0 else (high, low)
             for plane in {0.0, self.last[axis], inner[axis]} if self.cut else {0.0, self.last[axis]}:
-                i, j = (x.ravel() for x in np.indices((self.spec.shape[u], self.spec.shape[v])))
-                index = np.insert(np.stack([i, j], axis=1).astype(float), axis, plane, axis=1)
-                faces = squares(self.spec.shape[u], self.spec.shape[v])
+                nu, nv = (steps * int(self.last[k]) + 1 for k in (u, v))
+                i, j = (x.ravel() / steps for x in np.indices((nu, nv)))
+                index = np.insert(np.stack([i, j], axis=1), axis, plane, axis=1)
+                faces = squares(nu, nv)
                 middle = index[faces].mean(axis=1)[:, [u, v]]
                 gone = self.cut & ((middle > low[[u, v]]) & (middle < high[[u, v]])).all(axis=1)
                 if plane in (inner[axis], outer[axis]):

@@ -1,0 +1,133 @@
+"""What one new isovalue costs, part by part: ``python benchmarks/frame.py [--engine egl] [--json FILE]``.
+
+A sum of forty Gaussians on 128³ and on 256³ voxels, an illumination grid of 96³ nodes, pictures of 800 x 600. A frame
+is extraction (the capped isosurface and which of its faces are caps), lookup (the light at every vertex), tone (sRGB),
+and drawing (everything else that OpenGL is asked for, the transfer included). Beside it stands the same frame in which
+every vertex has one colour that nobody computes: less than any local light costs. What light adds to that frame is an
+upper bound of what it adds to one with local light. `--local` of ``illumgrid preview`` is timed too: its gradient
+normals cost more than the lookup.
+
+The frames take turns; times are medians of the rounds, by the clock on the wall, shares are of the same round. The rate
+of the lookup is that of the fastest round, one thread's own time. Where VTK is installed, its flying edges are timed
+on the same field.
+"""
+
+import argparse
+import importlib.util
+import json
+import time
+from dataclasses import replace
+
+import numpy as np
+from rays import ISOVALUE, gaussians
+
+from illumgrid import Scene, isosurface
+from illumgrid.grid import GridSpec, IlluminationGrid
+from illumgrid.illumination import Illumination
+from illumgrid.preview import choose_engine, fit_camera, gl, meshes
+from illumgrid.preview.shade import BACKGROUND, Shown
+from illumgrid.scene import level_table
+from illumgrid.tone import srgb_curve
+
+NODES, WIDTH, HEIGHT = 96, 800, 600
+
+
+def lit(volume):
+    """Illumination of smooth light: what it is does not matter here."""
+    scene = Scene.sky(volume, range=(0.2, 0.9))
+    spec = GridSpec.over(volume, NODES)
+    wave = 2 + np.sin(np.indices(spec.shape).sum(axis=0) / 9)
+    values = (wave[..., None] * np.array([1.0, 0.9, 0.8])).astype(np.float32)
+    grid = IlluminationGrid(spec, values, np.zeros(spec.shape), np.ones(spec.shape))
+    return Illumination(scene, level_table(scene, 2), (grid,), (), {"seed": 0})
+
+
+def flying_edges(values):
+    """VTK's extraction of the same level set."""
+    import vtk
+    from vtk.util.numpy_support import numpy_to_vtk
+
+    image = vtk.vtkImageData()
+    image.SetDimensions(*values.shape[::-1])
+    image.GetPointData().SetScalars(numpy_to_vtk(values.ravel()))
+    filter = vtk.vtkFlyingEdges3D()
+    filter.SetInputData(image)
+    filter.SetValue(0, ISOVALUE)
+    filter.ComputeNormalsOff()
+    filter.Update()
+
+
+def timed(seconds, name, work):
+    """Result of some work; its seconds are added to those of its name."""
+    start = time.perf_counter()
+    result = work()
+    seconds.setdefault(name, []).append(time.perf_counter() - start)
+    return result
+
+
+def measure(voxels, engine, rounds):
+    """All figures of one size of field."""
+    light = lit(gaussians(voxels))
+    field, row = light.scene.fields[0], np.array([ISOVALUE])
+    camera, ground = fit_camera(light.scene, row, WIDTH / HEIGHT), np.full(3, BACKGROUND, np.float32)
+    shown = Shown(light, row, 0.5, local=False)
+    seconds, rate = {}, 0.0
+
+    def drawn(parts):
+        return gl.draw(parts, camera, WIDTH, HEIGHT, ground, engine)
+
+    for _ in range(rounds + 1):
+        start = time.perf_counter()
+        drawn(meshes.triangles(shown, camera.eye))
+        seconds.setdefault("frame", []).append(time.perf_counter() - start)
+
+        plain = timed(seconds, "triangles", lambda: meshes.triangles(shown, camera.eye))
+        points = plain[0].points
+        begun = time.thread_time()
+        timed(seconds, "lookup", lambda: light.grids[0].lookup(points))
+        rate = max(rate, len(points) / (time.thread_time() - begun) / 1e6)
+        colors = timed(seconds, "lookup and exposure", lambda: shown.field(0, points, np.zeros(len(points))))
+        timed(seconds, "tone", lambda: srgb_curve(colors))
+        timed(seconds, "draw", lambda: drawn(plain))
+        timed(seconds, "isosurface", lambda: isosurface(field.volume, ISOVALUE, capped=True))
+        timed(seconds, "local frame", lambda: drawn(meshes.triangles(replace(shown, local=True), camera.eye)))
+        if importlib.util.find_spec("vtk"):
+            timed(seconds, "VTK flying edges", lambda: flying_edges(field.volume.values))
+    times = {name: np.array(spent[1:]) for name, spent in seconds.items()}
+    extraction = times["triangles"] - times["lookup and exposure"]
+    light_time, drawing = times["lookup and exposure"] + times["tone"], times["draw"] - times["tone"]
+    return {
+        "vertices": len(points),
+        "extraction ms": 1e3 * float(np.median(extraction)),
+        "of it scikit-image and trimesh ms": 1e3 * float(np.median(times["isosurface"])),
+        "lookup ms": 1e3 * float(np.median(times["lookup and exposure"])),
+        "tone ms": 1e3 * float(np.median(times["tone"])),
+        "drawing ms": 1e3 * float(np.median(drawing)),
+        "whole frame ms": 1e3 * float(np.median(times["frame"])),
+        "frame with --local ms": 1e3 * float(np.median(times["local frame"])),
+        "light adds %": 100 * float(np.median(light_time / (extraction + drawing))),
+        "lookup, million points a second": rate,
+        **{f"{n} ms": 1e3 * float(np.median(times[n])) for n in ("VTK flying edges",) if n in times},
+    }
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--engine", default="auto", help="egl, osmesa, or auto")
+    parser.add_argument("--rounds", type=int, default=7)
+    parser.add_argument("--json", help="write the figures here")
+    asked = parser.parse_args()
+    engine, why = choose_engine(asked.engine)
+    print(f"engine: {engine} ({why})")
+    if engine == "software":
+        parser.error("there is no OpenGL here; expected EGL or OSMesa")
+    figures = {voxels: measure(voxels, engine, asked.rounds) for voxels in (128, 256)}
+    for name in figures[128]:
+        print(f"{name:36} {figures[128][name]:10.1f} {figures[256][name]:10.1f}")
+    if asked.json:
+        with open(asked.json, "w") as file:
+            json.dump(figures, file, indent=2)
+
+
+if __name__ == "__main__":
+    main()

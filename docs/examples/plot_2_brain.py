@@ -1,0 +1,32 @@
+"""
+A brain: how deep is a fold?
+============================
+
+Figure 2 of Banks and Beason (2007): the folds of a brain. Local light draws every fold with the same dark line, deep or
+shallow. Global light reaches the bottom of a wide valley and not that of a narrow one.
+"""
+
+import matplotlib.pyplot as plt
+import numpy as np
+from gallery_fields import brain
+
+import illumgrid as ig
+from illumgrid.preview import render
+
+volume, limits, source = brain()
+light = ig.run(ig.Scene.sky(volume, albedo=(0.8, 0.66, 0.6), range=limits), grid=max(volume.shape), paths=24)
+
+# %%
+# **What to look for:** the cleft between the halves, and the one above the temple, are the deepest. On the left they
+# are lines like all others; on the right they are dark valleys, and the lower side, where the brain faces itself, is dim.
+
+figure, axes = plt.subplots(1, 2, figsize=(10, 4.4), facecolor="0.235", layout="constrained")
+for ax, local in zip(axes, (True, False)):
+    ax.imshow(render(light, isovalue=np.mean(limits), width=600, height=520, local=local))
+    ax.set_title("local light" if local else "global light", color="white")
+    ax.set_axis_off()
+plt.show()
+
+# %%
+
+print("Data:", source)
