@@ -1,7 +1,7 @@
 """The interactive page: its size against volume and grid, and what a frame costs in a browser without a screen.
 
-``python benchmarks/page.py [--repeats 15]``: needs Chromium and playwright. Frames are 320 x 240, drawn in software; global
-light, local light and no light at all take turns, so that a busy machine is as unkind to each; medians.
+``python benchmarks/page.py [--repeats 15]``: needs Chromium and playwright. Frames are 320 x 240, drawn in software;
+global light, local light and no light at all take turns, so that a busy machine is as unkind to each; medians.
 """
 
 import argparse

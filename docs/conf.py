@@ -1,6 +1,7 @@
 """How the pages are built: ``sphinx-build -W -b html docs docs/_build/html``."""
 
 from importlib.metadata import version as installed
+from pathlib import Path
 
 project = "illumgrid"
 author = "The illumgrid authors"
@@ -37,6 +38,10 @@ sphinx_gallery_conf = {
     "min_reported_time": 1e9,
     "capture_repr": (),
 }
+
+live = Path(__file__).parent / "live"  # pages that the gallery writes and the site carries as they are
+live.mkdir(exist_ok=True)
+html_extra_path = ["live"]
 
 html_theme = "pydata_sphinx_theme"
 html_title = "illumgrid"

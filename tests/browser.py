@@ -59,7 +59,11 @@ def bent(n=(22, 17, 25)):
 
     def height(x):
         p = (x - middle) @ centre.direction / 10
-        return np.linalg.norm(p * (1.0, 0.8, 1.1) - 0.2, axis=1) + 0.15 * np.sin(7 * p[:, 0]) * np.cos(5 * p[:, 1]) - 0.3 * p[:, 2]
+        return (
+            np.linalg.norm(p * (1.0, 0.8, 1.1) - 0.2, axis=1)
+            + 0.15 * np.sin(7 * p[:, 0]) * np.cos(5 * p[:, 1])
+            - 0.3 * p[:, 2]
+        )
 
     volume = sampled(height, n, **place)
     return Scene((Field("bent", volume, Material((0.9, 0.6, 0.3)), (0.3, 1.2), "below"),), background=np.ones(3))

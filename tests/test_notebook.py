@@ -54,8 +54,10 @@ def test_the_view_follows_the_model_and_leads_it(browser):  # noqa: F811
     lead = """async ([script, traits, data]) => {
         const bytes = Uint8Array.from(atob(data), (c) => c.charCodeAt(0)), heard = {};
         traits._data = new DataView(bytes.buffer);
-        globalThis.model = { get: (k) => traits[k], set: (k, v) => { traits[k] = v }, save_changes: () => { model.saved = traits.isovalue },
-            on: (k, f) => { heard[k] = f }, off: () => {}, lead: (v) => { traits.isovalue = v; heard['change:isovalue']() } };
+        globalThis.model = { get: (k) => traits[k], set: (k, v) => { traits[k] = v },
+            save_changes: () => { model.saved = traits.isovalue },
+            on: (k, f) => { heard[k] = f }, off: () => {},
+            lead: (v) => { traits.isovalue = v; heard['change:isovalue']() } };
         const module = await import(URL.createObjectURL(new Blob([script], { type: 'text/javascript' })));
         await module.default.render({ model, el: document.getElementById('here') });
     }"""

@@ -104,9 +104,21 @@ def test_a_drag_turns_the_object_with_the_hand_and_a_double_click_resets(browser
 def test_two_fingers_zoom(browser):  # noqa: F811
     page = browser.open(SCENES["bent"])
     zoom = """([moves]) => { const c = document.querySelector('canvas'); c.setPointerCapture = () => {};
-        for (const [kind, id, x] of moves) c.dispatchEvent(new PointerEvent(kind, { pointerId: id, clientX: x, clientY: 50, pointerType: 'touch' })); }"""
+        for (const [kind, pointerId, clientX] of moves) {
+            c.dispatchEvent(new PointerEvent(kind, { pointerId, clientX, clientY: 50, pointerType: 'touch' })); } }"""
     before = page.evaluate("illumgrid.state.view.distance")
-    page.evaluate(zoom, [[["pointerdown", 1, 60], ["pointerdown", 2, 90], ["pointermove", 2, 120], ["pointerup", 2, 120], ["pointerup", 1, 60]]])
+    page.evaluate(
+        zoom,
+        [
+            [
+                ["pointerdown", 1, 60],
+                ["pointerdown", 2, 90],
+                ["pointermove", 2, 120],
+                ["pointerup", 2, 120],
+                ["pointerup", 1, 60],
+            ]
+        ],
+    )
     assert page.evaluate("illumgrid.state.view.distance") == pytest.approx(before / 2)
 
 

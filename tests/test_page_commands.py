@@ -45,7 +45,9 @@ def test_view_serves_the_page_until_ctrl_c(folder):
         signal.signal(signal.SIGINT, signal.SIG_DFL)
 
     command = [*COMMAND, "view", str(folder), "--no-open"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=hear) as process:
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=hear
+    ) as process:
         try:
             address = re.search(r"http://127\.0\.0\.1:\d+/", process.stderr.readline())[0]
             with urllib.request.urlopen(address, timeout=20) as answer:

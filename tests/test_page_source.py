@@ -26,7 +26,9 @@ LIGHT = coloured(pair())
 
 def test_the_source_is_under_60_kb():
     text = page(LIGHT)
-    carried = re.findall(r'<script type="(?:application/json" id="scene|text/plain" id="data)">(.*?)</script>', text, re.S)
+    carried = re.findall(
+        r'<script type="(?:application/json" id="scene|text/plain" id="data)">(.*?)</script>', text, re.S
+    )
     assert len(carried) == 2
     assert len(text.encode()) - sum(map(len, carried)) < 60_000
 

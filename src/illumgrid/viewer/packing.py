@@ -1,7 +1,7 @@
 """From an `Illumination` to what the page draws: a description in JSON, and its arrays as one run of bytes.
 
-Everything is placed on a *stage*: world axes, the scene's box of size about 1 around its middle, so that single precision
-is enough for a graphics card wherever the data lie.
+Everything is placed on a *stage*: world axes, the scene's box of size about 1 around its middle, so that single
+precision is enough for a graphics card wherever the data lie.
 """
 
 from dataclasses import dataclass
@@ -30,7 +30,7 @@ _FINE = 4096  # steps that the swept range must span: else values far outside it
 _BINS = 96
 _HOLE = -1.0
 _SURE_TO_NOT = np.array([[0, 0.0144, 0.0742], [0.0742, 0.0865, 0.153], [0.376, 0.332, 0.174], [1, 0.823, 0.0612]])
-"""Linear colours of the error, after cividis (Nunez, Anderton, Renslow 2018): read alike with and without colour vision."""
+"""Linear colours of the error, after cividis (Nunez et al. 2018): read alike with and without colour vision."""
 
 
 @dataclass(frozen=True)
@@ -96,9 +96,7 @@ def _thinned(grid: IlluminationGrid) -> IlluminationGrid:
     if factor == 1 or min(grid.spec.shape) <= factor:
         return grid
     some = (slice(None, None, factor),) * 3
-    spec = GridSpec(
-        grid.support[some].shape, grid.spec.origin, grid.spec.spacing * factor, grid.spec.direction
-    )
+    spec = GridSpec(grid.support[some].shape, grid.spec.origin, grid.spec.spacing * factor, grid.spec.direction)
     return IlluminationGrid(spec, grid.values[some], grid.error[some], grid.support[some])
 
 
@@ -156,10 +154,16 @@ def _field(light: "Illumination", number: int, stage: Stage, into: Bytes, notes:
     sign = float(upward(light.scene)[number])
     ends = sorted(sign * field.range)
     steps, base, step, clamped = field_steps(turned(volume, field.inside)[0], (ends[0], ends[1]))
-    for what, before, after in (("field", field.volume.shape, volume.shape), ("light", whole.spec.shape, grid.spec.shape)):
+    for what, before, after in (
+        ("field", field.volume.shape, volume.shape),
+        ("light", whole.spec.shape, grid.spec.shape),
+    ):
         if before != after:
             sizes = " to ".join("\u2009×\u2009".join(map(str, shape)) for shape in (before, after))
-            notes.append(f"The {what} of {field.name} was reduced for this page from {sizes} {'voxels' if what == 'field' else 'nodes'}.")
+            notes.append(
+                f"The {what} of {field.name} was reduced for this page from {sizes} "
+                f"{'voxels' if what == 'field' else 'nodes'}."
+            )
     if clamped:
         notes.append(f"Values of {field.name} far outside the swept range were clamped for this page.")
     shown = light.exposure / np.pi

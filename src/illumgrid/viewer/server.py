@@ -22,7 +22,7 @@ class PageServer(ThreadingHTTPServer):
 class _Answer(BaseHTTPRequestHandler):
     server: PageServer
 
-    def do_GET(self) -> None:  # noqa: N802
+    def do_GET(self) -> None:
         """Answer with the page, to who asks for it by this machine's own name."""
         asked = (self.headers.get("Host") or "").rpartition(":")[0]
         if asked not in ("127.0.0.1", "localhost"):  # a name on the web that was pointed here

@@ -38,7 +38,9 @@ export function listen(canvas, scene, get, put, reset) {
       spread = apart();
     });
   }
+  const alone = canvas.getRootNode() === document && globalThis.top === globalThis.self;
   canvas.addEventListener("wheel", (event) => {
+    if (!alone && !canvas.matches(":focus")) return; // within another page: its scrolling goes on until one clicks here
     event.preventDefault();
     put(zoomed(get(), Math.exp(Math.max(-0.5, Math.min(0.5, event.deltaY * (event.deltaMode ? 0.05 : 0.0015))))));
   }, { passive: false });

@@ -5,10 +5,10 @@ import { complain, view } from "./view.js";
 
 async function render({ model, el }) {
   const place = document.createElement("div");
-  place.style.height = `${model.get("height")}px`;
+  place.style.cssText = `height: ${model.get("height")}px; container-type: inline-size`;
   el.append(place);
   const root = place.attachShadow({ mode: "open" });
-  root.innerHTML = `<style>:host { display: block; } ${model.get("_style")}</style>${model.get("_markup")}`;
+  root.innerHTML = `<style>${model.get("_style")}</style>${model.get("_markup")}`;
   try {
     const scene = JSON.parse(model.get("_scene")), held = model.get("_data");
     const data = await inflate(new Uint8Array(held.buffer, held.byteOffset, held.byteLength));
