@@ -69,7 +69,7 @@ window.plotter.window_size = [330, 240]
 pictures = []
 for isovalue in (2550.0, 2850.0):
     window.sweep(isovalue)
-    for widget in window.plotter.slider_widgets:
+    for widget in getattr(window.plotter, "widgets", window.plotter).slider_widgets:
         widget.Off()
     pictures.append(window.plotter.screenshot(None, return_img=True))
 np.save(sys.argv[1], np.array(pictures))

@@ -36,10 +36,11 @@ class Window:
                 "a window needs the package pyvista, which is missing; install illumgrid[desktop], "
                 "or leave out --desktop to look in the browser"
             ) from reason
-        self.light, self._pyvista = light, pyvista
+        self.light = light
+        self._pyvista: Any = pyvista
         field = light.scene.fields[0]
         low, high = map(float, field.range)
-        self.plotter: Any = pyvista.Plotter(off_screen=off_screen, title="illumgrid", window_size=[1100, 800])
+        self.plotter = self._pyvista.Plotter(off_screen=off_screen, title="illumgrid", window_size=[1100, 800])
         self.plotter.set_background([float(c) / 255 for c in encode_srgb(np.full(3, BACKGROUND))])
         self._look((low + high) / 2, 1100 / 800)
         self.sweep((low + high) / 2)

@@ -113,7 +113,7 @@ def field_steps(values: NDArray[np.float32], limits: tuple[float, float]) -> tup
     if clamped:
         span = limits[1] - limits[0]
         low, high = max(low, limits[0] - 8 * span), min(high, limits[1] + 8 * span)
-    step = (high - low) / _STEPS
+    step = (high - low) / _STEPS or 1.0
     steps = np.clip(np.round((values.astype(float) - low) / step), 0, _STEPS).astype(np.uint16)
     return steps, low, step, clamped
 
@@ -194,9 +194,7 @@ def _walls(light: "Illumination", stage: Stage, into: Bytes) -> tuple[list[dict[
     quads = light.scene.quads
     if not quads:
         return [], None
-    # A luminaire of one texel under a table of one row is a texture too; its sweep has at least one row.
-    rows = max(len(w.values) for w in light.walls)
-    wide, high = sum(q.texels[0] for q in quads), max(q.texels[1] for q in quads)
+    rows, wide, high = len(light.levels.table), sum(q.texels[0] for q in quads), max(q.texels[1] for q in quads)
     atlas, offset, described = np.zeros((wide, high, rows, 3), np.float32), 0, []
     for quad, wall in zip(quads, light.walls):
         nu, nv = quad.texels
