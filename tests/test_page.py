@@ -174,6 +174,6 @@ def test_a_browser_without_webgl2_gets_a_sentence(browser):  # noqa: F811
 
 
 def test_nothing_was_asked_of_the_network_and_nothing_went_wrong(browser):  # noqa: F811
-    assert len(browser.requests) > 5
+    assert browser.requests
     assert {url.partition(":")[0] for url in browser.requests} <= {"file", "about", "blob", "data"}
     assert not browser.troubles
