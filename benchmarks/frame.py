@@ -19,7 +19,7 @@ import time
 from dataclasses import replace
 
 import numpy as np
-from rays import ISOVALUE, gaussians
+from rays import ISOVALUE, gaussians, race
 
 from illumgrid import Scene, isosurface
 from illumgrid.grid import GridSpec, IlluminationGrid
@@ -57,43 +57,33 @@ def flying_edges(values):
     filter.Update()
 
 
-def timed(seconds, name, work):
-    """Result of some work; its seconds are added to those of its name."""
-    start = time.perf_counter()
-    result = work()
-    seconds.setdefault(name, []).append(time.perf_counter() - start)
-    return result
-
-
 def measure(voxels, engine, rounds):
     """All figures of one size of field."""
     light = lit(gaussians(voxels))
     field, row = light.scene.fields[0], np.array([ISOVALUE])
     camera, ground = fit_camera(light.scene, row, WIDTH / HEIGHT), np.full(3, BACKGROUND, np.float32)
     shown = Shown(light, row, 0.5, local=False)
-    seconds, rate = {}, 0.0
+    plain = meshes.triangles(shown, camera.eye)
+    points = plain[0].points
+    colors, facing = shown.field(0, points, np.zeros(len(points))), np.zeros(len(points))
+    parts = {
+        "frame": lambda: drawn(meshes.triangles(shown, camera.eye)),
+        "triangles": lambda: meshes.triangles(shown, camera.eye),
+        "lookup and exposure": lambda: shown.field(0, points, facing),
+        "tone": lambda: srgb_curve(colors),
+        "draw": lambda: drawn(plain),
+        "isosurface": lambda: isosurface(field.volume, ISOVALUE, capped=True),
+        "local frame": lambda: drawn(meshes.triangles(replace(shown, local=True), camera.eye)),
+    }
+    if importlib.util.find_spec("vtk"):
+        parts["VTK flying edges"] = lambda: flying_edges(field.volume.values)
 
-    def drawn(parts):
-        return gl.draw(parts, camera, WIDTH, HEIGHT, ground, engine)
+    def drawn(triangles):
+        return gl.draw(triangles, camera, WIDTH, HEIGHT, ground, engine)
 
-    for _ in range(rounds + 1):
-        start = time.perf_counter()
-        drawn(meshes.triangles(shown, camera.eye))
-        seconds.setdefault("frame", []).append(time.perf_counter() - start)
-
-        plain = timed(seconds, "triangles", lambda: meshes.triangles(shown, camera.eye))
-        points = plain[0].points
-        begun = time.thread_time()
-        timed(seconds, "lookup", lambda: light.grids[0].lookup(points))
-        rate = max(rate, len(points) / (time.thread_time() - begun) / 1e6)
-        colors = timed(seconds, "lookup and exposure", lambda: shown.field(0, points, np.zeros(len(points))))
-        timed(seconds, "tone", lambda: srgb_curve(colors))
-        timed(seconds, "draw", lambda: drawn(plain))
-        timed(seconds, "isosurface", lambda: isosurface(field.volume, ISOVALUE, capped=True))
-        timed(seconds, "local frame", lambda: drawn(meshes.triangles(replace(shown, local=True), camera.eye)))
-        if importlib.util.find_spec("vtk"):
-            timed(seconds, "VTK flying edges", lambda: flying_edges(field.volume.values))
-    times = {name: np.array(spent[1:]) for name, spent in seconds.items()}
+    seconds = race(parts.values(), rounds, time.perf_counter)
+    rate = len(points) / race([lambda: light.grids[0].lookup(points)], 20).min() / 1e6
+    times = dict(zip(parts, seconds.T))
     extraction = times["triangles"] - times["lookup and exposure"]
     light_time, drawing = times["lookup and exposure"] + times["tone"], times["draw"] - times["tone"]
     return {

@@ -1,5 +1,8 @@
 """How the pages are built: ``sphinx-build -W -b html docs docs/_build/html``."""
 
+import os
+import subprocess
+import sys
 from importlib.metadata import version as installed
 from pathlib import Path
 
@@ -52,3 +55,9 @@ html_theme_options = {
     "footer_start": ["copyright"],
     "footer_end": [],
 }
+
+# The page of the stages shows what the command says, on the day that the pages are built.
+listing = Path(__file__).parent / "api" / "generated" / "stages.txt"
+listing.parent.mkdir(parents=True, exist_ok=True)
+command = [sys.executable, "-m", "illumgrid", "plugins"]
+listing.write_bytes(subprocess.check_output(command, env={**os.environ, "ILLUMGRID_DISABLE_PLUGINS": "1"}))

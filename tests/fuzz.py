@@ -30,8 +30,8 @@ from test_store_trust import reseal
 from volume_files import values, write, write_series
 
 CORPUS = Path(__file__).with_name("corpus")
-SECONDS = 20
-"""A case that takes longer hangs."""
+SECONDS = 10
+"""Seconds of the processor: a case that takes more hangs."""
 ROOM = 1 << 30
 """Bytes of memory that a case may take beyond what the process has: the files are a few kilobytes."""
 
@@ -198,8 +198,8 @@ def _child(work: Callable[[int], None]) -> tuple[list[str], int]:
 
 
 def _ended(status: int) -> str:
-    if os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGALRM:
-        return f"hung for {SECONDS} s"
+    if os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGPROF:
+        return f"hung: {SECONDS} s of work"
     return f"the process ended with status {status}"
 
 
@@ -207,7 +207,7 @@ def alone(target: Target, file: Path) -> str:
     """`judge` in a process of its own."""
 
     def work(tell: int) -> None:
-        signal.alarm(SECONDS)
+        signal.setitimer(signal.ITIMER_PROF, SECONDS)
         os.write(tell, f"{judge(target, file)}\n".encode())
 
     lines, status = _child(work)
@@ -225,10 +225,10 @@ def batch(target: Target, seed: int, cases: int) -> Iterator[tuple[int, str]]:
             for case in range(seed, seed + cases):
                 os.write(tell, f"{case}\n".encode())
                 file.write_bytes(mutate(clean, random.Random(f"{target.name} {case}")))
-                signal.alarm(SECONDS)
+                signal.setitimer(signal.ITIMER_PROF, SECONDS)
                 if what := judge(target, file):
                     os.write(tell, f"! {what}\n".encode())
-                signal.alarm(0)
+                signal.setitimer(signal.ITIMER_PROF, 0)
 
     lines, status = _child(work)
     at = seed

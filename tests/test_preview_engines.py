@@ -39,7 +39,7 @@ def chiral(direction):
     fields = []
     for number, (at, radius) in enumerate((((0.6, 0, 0), 0.3), ((0, -0.6, 0), 0.22), ((0, 0, 0.6), 0.38))):
         volume = sampled(
-            lambda x, at=np.array(at), radius=radius: 1 + radius - np.linalg.norm((x - 5) @ direction - at, axis=1),
+            lambda x, at=at, radius=radius: 1 + radius - np.linalg.norm((x - 5) @ direction - np.array(at), axis=1),
             tuple(shape), 5 - direction @ np.ones(3), spacing, direction,
         )  # fmt: skip
         fields.append(Field("abc"[number], volume, Material(np.roll([0.9, 0.5, 0.2], number)), (0.9, 1.1)))

@@ -13,7 +13,7 @@ from illumgrid.preview.sweep import check_ending, film, frames, labelled
 from shapes import lit, refused, sky
 from test_tone_preview import three_balls
 
-RUN = "run v.npy --range 0.3 0.9 --grid 6 --paths 2 --no-preview -o out".split()
+RUN = ["run", "v.npy", "--range", 0.3, 0.9, "--grid", 6, "--paths", 2, "--no-preview", "-o", "out"]
 
 
 @pytest.fixture
@@ -49,9 +49,10 @@ def test_a_film_has_a_frame_for_each_isovalue_and_starts_again(call, out, ending
             assert image.info["duration"] == 500
     wide = [np.ptp(np.flatnonzero((f[:80].max(axis=2) > 90).any(axis=0))) for f in found]
     assert (np.diff(wide) < 0).all()  # one camera: the ball shrinks
-    # The radius is 1.2 - c, the first and the last isovalue are the ends of the range, and a pixel is lost at each side.
-    eye = fit_camera(out.scene, widest_row(out.scene), 1.5).eye
-    first, last = (r / np.sqrt(eye @ eye - r * r) for r in (0.9, 0.3))  # the ball is seen by this tangent
+    # The first and the last isovalue are the ends of the range; a ball of radius r is seen by this tangent.
+    eye = fit_camera(out.scene, widest_row(out.scene), 1.5).eye - out.scene.from_frame(np.full(3, 4.5))
+    radii = (np.ptp(ig.isosurface(out.scene.fields[0].volume, c).bounds[:, 0]) / 2 for c in (0.3, 0.9))
+    first, last = (r / np.sqrt(eye @ eye - r * r) for r in radii)
     assert wide[-1] / wide[0] == pytest.approx(last / first, abs=0.03)
     bright = [f[:80][f[:80].max(axis=2) > 90].mean() for f in found]
     assert np.ptp(bright) < 0.1 * np.mean(bright)  # one exposure

@@ -1,4 +1,4 @@
-"""Volumes for the gallery: real ones where the folder ``../shared/volumes`` stands beside the project, else made by code."""
+"""Volumes for the gallery: real ones where ``../shared/volumes`` stands beside the project, else made by code."""
 
 from pathlib import Path
 
@@ -45,4 +45,5 @@ def brain():
     x, y, z = np.meshgrid(*[np.linspace(-1, 1, 64)] * 3, indexing="ij")
     radius = np.sqrt(x**2 + (0.85 * y) ** 2 + (1.15 * z) ** 2)
     folds = np.sin(17 * x + 3 * np.sin(6 * y)) * np.sin(17 * y + 3 * np.sin(6 * z)) * np.sin(17 * z + 3 * np.sin(6 * x))
-    return ig.Volume(1 - radius + 0.12 * folds, (-1, -1, -1), (2 / 63,) * 3), (0.15, 0.45), "a folded ball, made by code"
+    ball = ig.Volume(1 - radius + 0.12 * folds, (-1, -1, -1), (2 / 63,) * 3)
+    return ball, (0.15, 0.45), "a folded ball, made by code"

@@ -2,9 +2,9 @@
 A neuron: near or far?
 ======================
 
-Figure 1 of Banks and Beason (2007) shows a neuron twice. Local light says how a surface faces the eye, and nothing else:
-the branches could lie in one plane. Global light comes from somewhere, is held up by what is in its way, and so tells
-what is above what.
+Figure 1 of Banks and Beason (2007) shows a neuron twice. Local light says how a surface faces the eye, and nothing
+else: the branches could lie in one plane. Global light comes from somewhere, is held up by what is in its way, and so
+tells what is above what.
 """
 
 from dataclasses import replace
@@ -33,8 +33,8 @@ light = ig.run(scene, grid=128, paths=32, bounces=2, isovalues=4)
 
 # %%
 # **What to look for:** on the left nothing says how high a branch runs above the floor, or which of two that cross is
-# nearer. On the right each throws a shadow: the farther the shadow lies from its branch and the softer it is, the higher
-# the branch; where both meet, it touches the floor. Branches in a bundle dim each other.
+# nearer. On the right each throws a shadow: the farther the shadow lies from its branch and the softer it is, the
+# higher the branch; where both meet, it touches the floor. Branches in a bundle dim each other.
 
 figure, axes = plt.subplots(1, 2, figsize=(10, 4.6), facecolor="0.235", layout="constrained")
 for ax, local in zip(axes, (True, False)):

@@ -18,7 +18,8 @@ light = ig.run(ig.Scene.sky(volume, albedo=(0.8, 0.66, 0.6), range=limits), grid
 
 # %%
 # **What to look for:** the cleft between the halves, and the one above the temple, are the deepest. On the left they
-# are lines like all others; on the right they are dark valleys, and the lower side, where the brain faces itself, is dim.
+# are lines like all others; on the right they are dark valleys, and the gap below, where the brain faces itself, is
+# darkest of all.
 
 figure, axes = plt.subplots(1, 2, figsize=(10, 4.4), facecolor="0.235", layout="constrained")
 for ax, local in zip(axes, (True, False)):

@@ -3,7 +3,8 @@ The grid itself
 ===============
 
 Figure 6 of Banks and Beason (2007): the illumination grid as a block of light. Each point of it has the colour that the
-isosurface through that point would show there. Cutting an isosurface out of this block is all that a new isovalue costs.
+isosurface through that point would show there. To cut an isosurface out of this block is all that a new isovalue
+costs.
 
 ``illumgrid preview DIR --grid-volume --cut --output block.png`` makes the same picture.
 """
@@ -17,11 +18,11 @@ from illumgrid.preview import grid_volume, render
 
 density = spread(np.random.default_rng(4).uniform(-0.5, 0.5, (14, 3)), voxels=48, sigma=0.2)
 volume = density.with_values(density.values**0.2)  # isosurfaces everywhere, at even distances
-light = ig.run(ig.Scene.box(volume, range=(0.1, 0.98)), grid=48, paths=24, bounces=3)
+light = ig.run(ig.Scene.box(volume, range=(0.5, 0.98)), grid=48, paths=32, bounces=3)
 
 # %%
 # **What to look for:** the red wall and the green one colour the block from either side, and the lamp brightens it from
-# below, but only where an isosurface can see them: towards the middle, deep in the clefts between the lumps, it is dark.
+# below, but only where an isosurface can see them: deep in the clefts between the lumps it is dark.
 # Dim parts belong to no isosurface of the range; their nodes hold the light of the nearest one that does.
 
 figure, axes = plt.subplots(1, 3, figsize=(10.5, 3.5), facecolor="0.235", layout="constrained")

@@ -3,11 +3,11 @@ Two fields, one sweep
 =====================
 
 Figure 7 of Banks and Beason (2007): the densities of protons and neutrons in a nucleus, lit together. Each field has a
-grid of its own, and light passes between their isosurfaces; one slider moves both. The walls have textures that know the
-place of the slider too.
+grid of its own, and light passes between their isosurfaces; one slider moves both. The walls have textures that know
+the place of the slider too.
 
-Light a scene once, then draw any of its isosurfaces without asking for light again: the pictures below differ in nothing
-but the isovalue. ``illumgrid preview nucleus-light --sweep 24 nucleus.webp`` makes a film of it.
+Light a scene once, then draw any of its isosurfaces without asking for light again: the pictures below differ in
+nothing but the isovalue. ``illumgrid preview nucleus-light --sweep 24 nucleus.webp`` makes a film of it.
 """
 
 import matplotlib.pyplot as plt

@@ -23,9 +23,12 @@ from illumgrid.stages import Backend, Interpolator, Sampler
 OWN = (
     "samplers.direct",
     "samplers.uniform",
+    "samplers.adaptive",
     "backends.numba_",
     "backends.reference",
     "interpolators.nearest",
+    "interpolators.splat",
+    "interpolators.rbf",
 )
 """The package's own files of stages: each has hooks, as the module of a plugin has. A new stage is one line here."""
 

@@ -336,8 +336,9 @@ def is_run(folder: str | os.PathLike[str]) -> bool:
     return (Path(folder) / RUN).is_file() or (Path(folder) / EXR).is_file()
 
 
-def write_file(path: str | os.PathLike[str], content: bytes) -> None:
-    """Write a file beside its place and rename it: whole, or not there.
+@contextmanager
+def fresh_file(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """Give a place beside `path` to write a file to, and rename it in the end: whole, or not there.
 
     Raises
     ------
@@ -345,14 +346,20 @@ def write_file(path: str | os.PathLike[str], content: bytes) -> None:
         If it cannot be written.
     """
     place = Path(path)
-    with _sentences(f"{path} could not be written", "choose another place with -o"):
+    with _sentences(f"{path} could not be written", "choose another place"):
         if place.is_dir():
             raise BadInput(f"{path} is a folder; expected the name of a file")
         place.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=f".{place.name[:50]}-", dir=place.parent) as work:
-            fresh = Path(work) / "new"
-            fresh.write_bytes(content)
+            fresh = Path(work) / f"new{place.suffix}"  # libraries choose the format by the ending
+            yield fresh
             fresh.replace(place)
+
+
+def write_file(path: str | os.PathLike[str], content: bytes) -> None:
+    """Write a file as `fresh_file` does."""
+    with fresh_file(path) as fresh:
+        fresh.write_bytes(content)
 
 
 def write_folder(path: str | os.PathLike[str], files: Iterator[tuple[str, bytes]]) -> None:

@@ -162,7 +162,7 @@ def smooth(volume: Volume, sigma: float) -> Volume:
     return volume.with_values(gaussian_filter(volume.values, sigma, mode="nearest"))
 
 
-def cells(volume: Volume, index: Floats) -> tuple[NDArray[np.int64], Floats]:
+def cells(volume: Lattice, index: Floats) -> tuple[NDArray[np.int64], Floats]:
     """Cell (n, 3) that holds each fractional index (n, 3), and the position within it, 0 to 1."""
     cell = np.clip(np.floor(index), 0, np.array(volume.shape) - 2).astype(np.int64)
     return cell, np.clip(index - cell, 0.0, 1.0)

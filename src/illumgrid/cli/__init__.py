@@ -6,7 +6,9 @@ from typing import Annotated, Any
 
 import typer
 
+from illumgrid.cli.export import export
 from illumgrid.cli.info import info
+from illumgrid.cli.plugins import plugins
 from illumgrid.cli.preview import preview
 from illumgrid.cli.run import run
 from illumgrid.cli.told import say
@@ -21,7 +23,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
-for command in (run, preview, view, info, verify):
+for command in (run, preview, view, export, info, verify, plugins):
     app.command()(command)
 
 

@@ -16,9 +16,7 @@ if TYPE_CHECKING:
 
 def preview(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="A finished run.")],
-    output: Annotated[
-        Path | None, typer.Option("--output", "-o", metavar="PNG", help="The picture to write.")
-    ] = None,
+    output: Annotated[Path | None, typer.Option("--output", "-o", metavar="PNG", help="The picture to write.")] = None,
     sweep: Annotated[
         tuple[int, Path] | None,
         typer.Option(

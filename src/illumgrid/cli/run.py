@@ -121,7 +121,7 @@ def run(
     output: Annotated[
         Path | None, typer.Option("--output", "-o", metavar="DIR", help="Where the result goes. [default: INPUT-light]")
     ] = None,
-    sampler: Annotated[str, typer.Option(help="Where to ask for light: direct, uniform.")] = "direct",
+    sampler: Annotated[str, typer.Option(help="Where to ask for light: direct, uniform, adaptive.")] = "direct",
     isovalues: Annotated[
         int | None, typer.Option(min=2, metavar="K", help="Rows of the level table; sampler.count too. [default: 32]")
     ] = None,
@@ -145,7 +145,7 @@ def run(
         ),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, max=2**64 - 1, metavar="N", help="Equal seeds give equal light.")] = 0,
-    interpolator: Annotated[str, typer.Option(help="From samples to nodes: nearest.")] = "nearest",
+    interpolator: Annotated[str, typer.Option(help="From samples to nodes: nearest, splat, rbf.")] = "nearest",
     grid: Annotated[
         int | None,
         typer.Option(min=2, metavar="N", help="Nodes along the longest axis. [default: as voxels, at most 128]"),

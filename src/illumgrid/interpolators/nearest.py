@@ -4,26 +4,13 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from illumgrid.grid import GridSpec, IlluminationGrid, fill_holes
+from illumgrid.interpolators.neighbours import diagonal, near_samples
 from illumgrid.samples import Samples
 from illumgrid.stages import Interpolator, hookimpl
-from illumgrid.volume import Floats, world_to_index
 
 _SLAB = 1 << 18  # nodes asked at once: bounds the memory of a search
-
-
-def near_samples(spec: GridSpec, points: Floats, reach: float) -> NDArray[np.bool_]:
-    """Nodes (nx, ny, nz) in whose box of half-width `reach` there may be one of the world points (n, 3)."""
-    from scipy.ndimage import maximum_filter
-
-    taken = np.zeros(spec.shape, bool)
-    closest = np.clip(np.round(world_to_index(spec, points)), 0, np.array(spec.shape) - 1).astype(np.int64)
-    taken[tuple(closest.T)] = True
-    # A point is at most half a node from the one that it is rounded to.
-    width = 2 * np.ceil(reach / spec.spacing + 0.5).astype(int) + 1
-    return np.asarray(maximum_filter(taken, size=tuple(width), mode="constant"))
 
 
 @dataclass(frozen=True)
@@ -45,7 +32,7 @@ class Nearest:
             # Distances from the grid's origin: far from the world's, differences of large numbers would lose digits.
             points = samples.queries.point[good] - spec.origin
             tree = KDTree(points)
-            reach = float(np.linalg.norm(spec.spacing)) * (1 + 1e-6)
+            reach = diagonal(spec)
             mean, own_error = samples.mean[good], samples.error[good]
             candidates = np.flatnonzero(near_samples(spec, samples.queries.point[good], reach))
             for first in range(0, len(candidates), _SLAB):

@@ -108,9 +108,7 @@ def _complete_osmesa() -> None:
     OpenGL.platform.GetCurrentContext = current
 
 
-def draw(
-    parts: list[Colored], camera: Camera, width: int, height: int, background: Colors, platform: str
-) -> Colors:
+def draw(parts: list[Colored], camera: Camera, width: int, height: int, background: Colors, platform: str) -> Colors:
     """Display-linear picture (height, width, 3) of triangles; `unavailable(platform)` said None."""
     pyrender, renderer = _opened[platform]
     scene = pyrender.Scene(bg_color=[*map(float, srgb_curve(background)), 1.0])

@@ -21,9 +21,7 @@ SECONDS, SHORTEST, LONGEST = 4.0, 0.04, 0.5
 ENDINGS = (".gif", ".webp", ".mp4")
 
 
-def frames(
-    light: "Illumination", field: str | None, count: int, draw: Callable[[float], Picture]
-) -> Iterator[Picture]:
+def frames(light: "Illumination", field: str | None, count: int, draw: Callable[[float], Picture]) -> Iterator[Picture]:
     """`count` pictures by `draw`, called with equal steps of the isovalue of `field` through its range."""
     scene = light.scene
     number = 0 if field is None else scene.number_of(field)
@@ -89,7 +87,8 @@ def _one_palette(pictures: list[Picture]) -> list[Any]:
     from PIL import Image
 
     some = pictures[:: max(1, len(pictures) // 8)]
-    palette = Image.fromarray(np.concatenate([p[::2, ::2] for p in some])).quantize(256, method=Image.Quantize.FASTOCTREE)
+    together = Image.fromarray(np.concatenate([p[::2, ::2] for p in some]))
+    palette = together.quantize(256, method=Image.Quantize.FASTOCTREE)
     return [Image.fromarray(p).quantize(palette=palette, dither=Image.Dither.FLOYDSTEINBERG) for p in pictures]
 
 

@@ -24,12 +24,12 @@ __all__ = ["read_scene", "read_volume", "volume_name"]
 
 KNOWN = {
     *(".nrrd", ".nhdr", ".nii", ".hdr", ".img", ".mha", ".mhd", ".tif", ".tiff", ".mrc", ".rec", ".map", ".ccp4"),
-    *(".vtk", ".dcm", ".ima", ".h5", ".hdf5", ".gipl", ".npy", ".npz"),
+    *(".vtk", ".vti", ".dcm", ".ima", ".h5", ".hdf5", ".gipl", ".npy", ".npz"),
 }
 HEADER_FIRST = {".nrrd", ".nii", ".mha", ".mrc", ".rec", ".map", ".vtk", ".gipl"}
 """Formats that say their size at the beginning; TIFF, HDF5 and zip need not."""
 
-EXPECTED = "expected a NRRD, NIfTI, MetaImage, TIFF, MRC, legacy VTK, .npy or .npz file or a DICOM folder"
+EXPECTED = "expected a NRRD, NIfTI, MetaImage, TIFF, MRC, legacy VTK, .vti, .npy or .npz file or a DICOM folder"
 
 UNREADABLE = (
     *(RuntimeError, OSError, EOFError, ValueError, TypeError, OverflowError, SyntaxError),
@@ -54,8 +54,9 @@ def read_volume(path: str | os.PathLike[str]) -> Volume:
     ----------
     path : str or path-like
         NRRD, NIfTI, MetaImage, multi-page TIFF, MRC, legacy VTK or anything else that SimpleITK reads; a folder with
-        one DICOM series; `.npy`; `.npz` with one 3D array, or one named `values`, and optional `origin` (3,),
-        `spacing` (3,) and `direction` (3, 3). Each file also gzipped (`brain.nrrd.gz`).
+        one DICOM series; `.vti` (with the package `vtk`: its scalars, at the points); `.npy`; `.npz` with one 3D array,
+        or one named `values`, and optional `origin` (3,), `spacing` (3,) and `direction` (3, 3). Each file also gzipped
+        (`brain.nrrd.gz`).
 
     Returns
     -------
@@ -124,6 +125,10 @@ def _read_unpacked(file: Path, size: int) -> Volume:
     if ending == ".npy":
         with open(file, "rb") as stream:
             return Volume(read_npy(stream, size))
+    if ending == ".vti":
+        from illumgrid.readers.vti import read_vti
+
+        return read_vti(file, size * DEFLATE)
     from illumgrid.readers.itk import read_image
 
     return read_image(file, size * DEFLATE)

@@ -1,0 +1,197 @@
+"""Where methods fail: the error of every method against the parameter that breaks it.
+
+``python benchmarks/stability.py`` measures (about ten minutes on two cores) and writes the figure and the numbers of
+the page "Where methods fail" into docs/images; ``--only noise`` measures one curve and prints it.
+"""
+
+import argparse
+import json
+import warnings
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+import illumgrid as ig
+from illumgrid.samples import join_queries
+from illumgrid.scene import Material, Scene
+from illumgrid.truth import begin, converge, errors, look_up, unseen_on_level_sets
+from illumgrid.volume import Volume
+
+METHODS = {
+    "direct": ("direct", "nearest"),
+    "uniform, nearest": ("uniform", "nearest"),
+    "uniform, splat": ("uniform", "splat"),
+    "uniform, rbf": ("uniform", "rbf"),
+    "adaptive, splat": ("adaptive", "splat"),
+}
+IMAGES = Path(__file__).parents[1] / "docs" / "images"
+N = 40
+
+
+def hills(n: int = N, seed: int = 0, noise: float = 0.0, flatten: float = 1.0, stretch: float = 1.0) -> Volume:
+    """A sum of Gaussians in the unit cube and white noise; with `stretch` fewer, longer voxels along z."""
+    random = np.random.default_rng(seed)
+    shape = np.array([n, n, max(2, round((n - 1) / stretch) + 1)])
+    step = 1 / (shape - 1)
+    x = np.stack(np.indices(shape), axis=-1) * step
+    values = np.zeros(shape)
+    for _ in range(20):
+        at, width = random.uniform(0.3, 0.7, 3), random.uniform(0.06, 0.1)
+        values += np.exp(-((x - at) ** 2).sum(axis=-1) / (2 * width**2))
+    values = values / values.max()
+    return Volume(values + noise * random.standard_normal(shape), spacing=step)
+
+
+def sky(volume: Volume, low: float = 0.15, high: float = 0.75) -> Scene:
+    """Under a white sky."""
+    return Scene.sky(volume, range=(low, high))
+
+
+def sheet(nodes: float) -> Scene:
+    """A plate of so many node spacings, lit from above; below it is a black floor."""
+    x = (np.stack(np.indices((N, N, N)), axis=-1) - (N - 1) / 2) / (N / 2)
+    depth = np.maximum(np.abs(x[..., 2]) - nodes / N, np.abs(x[..., :2]).max(axis=-1) - 0.8)
+    scene = Scene.floor(Volume(-depth), range=(-0.3 * nodes / N, 0.3 * nodes / N))
+    return replace(scene, quads=tuple(replace(q, material=Material(np.zeros(3))) for q in scene.quads))
+
+
+def pair() -> Scene:
+    """Two balls that melt into one at isovalue 0.7."""
+    x = (np.stack(np.indices((60, N, N)), axis=-1) - [29.5, 19.5, 19.5]) / 19.5
+    distance = [np.linalg.norm(x - [side * 0.5, 0, 0], axis=-1) for side in (-1, 1)]
+    return Scene.sky(Volume(1.2 - np.minimum(*distance)), range=(0.5, 0.9))
+
+
+def power(p: float) -> Scene:
+    """1 - r^p: the gradient vanishes towards the middle, the faster the larger p."""
+    x = (np.stack(np.indices((N, N, N)), axis=-1) - (N - 1) / 2) / (N / 2)
+    return Scene.sky(Volume(1 - np.linalg.norm(x, axis=-1) ** p), range=(0.2, 0.98))
+
+
+def lit(scene: Scene, method: str, levels: int = 16, paths: int = 64, grid: int | None = None) -> "ig.Illumination":
+    """The light of a scene by one of the methods."""
+    sampler, interpolator = METHODS[method]
+    options = {} if sampler == "direct" else {"count": levels}
+    return ig.run(
+        scene, sampler=ig.sampler(sampler, **options), interpolator=interpolator, backend="numba", grid=grid,
+        paths=paths, bounces=3, isovalues=2,
+    )  # fmt: skip
+
+
+def judged(scene: Scene, grids: dict[str, "ig.Illumination"]) -> dict[str, float]:
+    """Relative RMSE of each at points on isovalues that nobody visited."""
+    backend = ig.backend("numba")
+    asked = unseen_on_level_sets(scene, 12, 600, 7)
+    truth = converge(begin(scene, backend, asked, 3, 7), scene, backend, 7, 0.005, 2048)
+    return {name: errors(look_up(light.grids, truth.samples.queries), truth).rmse for name, light in grids.items()}
+
+
+def swept(values: list[float], make: Callable[[float], Scene]) -> Iterator[tuple[float, dict[str, float]]]:
+    """A scene for each value of the parameter, judged for all methods."""
+    for value in values:
+        scene = make(value)
+        yield value, judged(scene, {name: lit(scene, name) for name in METHODS})
+
+
+def by_levels() -> Iterator[tuple[float, dict[str, float]]]:
+    """The number of isovalues that are visited."""
+    scene = sky(hills())
+    for count in (2, 4, 8, 16, 32, 64):
+        yield count, judged(scene, {name: lit(scene, name, levels=count) for name in METHODS})
+
+
+def by_nodes() -> Iterator[tuple[float, dict[str, float]]]:
+    """Nodes to a voxel."""
+    scene = sky(hills())
+    for share in (0.25, 0.5, 1.0, 2.0):
+        grid = round(share * (N - 1)) + 1
+        yield share, judged(scene, {name: lit(scene, name, grid=grid) for name in METHODS})
+
+
+def by_paths() -> Iterator[tuple[float, dict[str, float]]]:
+    """Paths to a query."""
+    scene = sky(hills())
+    for paths in (1, 2, 4, 16, 64, 256):
+        yield paths, judged(scene, {name: lit(scene, name, paths=paths) for name in METHODS})
+
+
+def by_distance() -> Iterator[tuple[float, dict[str, float]]]:
+    """Distance of the isovalue from a critical one, on either side."""
+    scene = pair()
+    grids = {name: lit(scene, name) for name in METHODS}
+    backend = ig.backend("numba")
+    for off in (0.002, 0.005, 0.01, 0.02, 0.05, 0.1):
+        parts = []
+        for level in (0.7 - off, 0.7 + off):
+            mesh = ig.isosurface(scene.fields[0].volume, level)
+            near = mesh.vertices[np.abs(mesh.vertices[:, 0] - 29.5) < 6]  # around the neck
+            parts.append(
+                ig.Queries.at(scene, near[:: max(1, len(near) // 300)], level=level, first_id=len(parts) << 20)
+            )
+
+        asked = join_queries(parts)
+        asked = asked[np.flatnonzero(asked.normal.any(axis=1))]
+        truth = converge(begin(scene, backend, asked, 3, 7), scene, backend, 7, 0.005, 2048)
+        yield off, {n: errors(look_up(light.grids, truth.samples.queries), truth).rmse for n, light in grids.items()}
+
+
+CURVES: dict[str, tuple[str, Callable[[], Iterator[tuple[float, dict[str, float]]]]]] = {
+    "noise": ("standard deviation of white noise / largest value",
+              lambda: swept([0.002, 0.01, 0.03, 0.1], lambda s: sky(hills(noise=s)))),
+    "sheet": ("thickness of a plate / node spacing", lambda: swept([0.5, 1, 2, 3, 4, 6], sheet)),
+    "anisotropy": ("length of a voxel / its width",
+                   lambda: swept([1, 2, 4, 6, 10], lambda r: sky(hills(stretch=r)))),
+    "gradient": ("exponent p of 1 - r^p", lambda: swept([1, 2, 4, 8, 16], power)),
+    "critical": ("distance from a critical isovalue", by_distance),
+    "levels": ("isovalues visited", by_levels),
+    "nodes": ("nodes to a voxel", by_nodes),
+    "paths": ("paths to a query", by_paths),
+}  # fmt: skip
+
+
+def draw(measured: dict[str, list[tuple[float, dict[str, float]]]]) -> None:
+    """One panel a curve."""
+    import matplotlib.pyplot as plt
+
+    figure, panels = plt.subplots(2, 4, figsize=(14, 6.4), layout="constrained", sharey=True)
+    for panel, (name, points) in zip(panels.flat, measured.items()):
+        for method, marker in zip(METHODS, "osD^v"):
+            panel.plot([x for x, _ in points], [y[method] for _, y in points], f"-{marker}", label=method, ms=4, lw=1)
+        panel.set(xscale="log", yscale="log", xlabel=CURVES[name][0], title=name)
+        panel.grid(alpha=0.3)
+    for panel in panels[:, 0]:
+        panel.set_ylabel("relative RMSE at unseen isovalues")
+    panels[0, 0].legend(fontsize=8)
+    figure.savefig(IMAGES / "stability.png", dpi=110)
+
+
+def table(measured: dict[str, list[tuple[float, dict[str, float]]]]) -> str:
+    """The numbers as the page includes them."""
+    lines = ["| parameter | value | " + " | ".join(METHODS) + " |", "|---" * (2 + len(METHODS)) + "|"]
+    for name, points in measured.items():
+        for value, result in points:
+            lines.append(f"| {CURVES[name][0]} | {value:g} | " + " | ".join(f"{result[m]:.3f}" for m in METHODS) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def main() -> None:
+    """Measure the curves."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--only", choices=list(CURVES))
+    asked = parser.parse_args()
+    warnings.simplefilter("ignore")
+    measured = {}
+    for name in CURVES if asked.only is None else [asked.only]:
+        measured[name] = list(CURVES[name][1]())
+        for value, result in measured[name]:
+            print(f"{name:11} {value:8g}  " + "  ".join(f"{m} {e:.4f}" for m, e in result.items()), flush=True)
+    if asked.only is None:
+        (IMAGES / "stability.json").write_text(json.dumps(measured, indent=1))
+        (IMAGES / "stability_table.md").write_text(table(measured))
+        draw(measured)
+
+
+if __name__ == "__main__":
+    main()

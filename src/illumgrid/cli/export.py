@@ -1,0 +1,46 @@
+"""``illumgrid export``: the light of a finished run in a file for another program."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from illumgrid.cli.told import heard, say, told_progress
+from illumgrid.errors import BadInput
+
+
+def export(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="A finished run.")],
+    file: Annotated[
+        Path, typer.Argument(metavar="FILE", help="What to write: .vti .nrrd .exr .npz (grid), .glb .ply (isosurface).")
+    ],
+    field: Annotated[str | None, typer.Option(metavar="NAME", help="Which field's light. [default: the first]")] = None,
+    isovalue: Annotated[
+        float | None,
+        typer.Option(metavar="C", help="Which isosurface (.glb, .ply). [default: the middle of the range]"),
+    ] = None,
+    on: Annotated[
+        str | None,
+        typer.Option(metavar="grid|field", help="On the grid's nodes or the field's voxels. [default: grid]"),
+    ] = None,
+    array: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME",
+            help="Which array a .nrrd holds: irradiance, error, support, field, color. [default: irradiance]",
+        ),
+    ] = None,
+) -> None:
+    """Write the light of a finished run for another program."""
+    from illumgrid import exports, store
+    from illumgrid.illumination import load
+
+    exports.check(file, isovalue, on, array)
+    own = folder / store.EXR
+    if file.exists() and own.exists() and file.samefile(own):
+        raise BadInput(f"{file} is the run itself; expected another name for the copy")
+    with heard():
+        light = load(folder)
+        with told_progress() as progress:
+            told = exports.write(light, file, field, isovalue, on=on, array=array, progress=progress)
+    say(f"wrote {file}: {told}")

@@ -1,0 +1,49 @@
+"""``illumgrid plugins``: every stage, with its options and where it comes from."""
+
+import inspect
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+import typer
+
+from illumgrid.cli.told import heard
+
+if TYPE_CHECKING:
+    from illumgrid.registry import Entry
+
+
+def plugins() -> None:
+    """List every sampler, backend and interpolator: options, package of origin, whether it can run here.
+
+    An option is set by --set STAGE.OPTION=VALUE, such as --set sampler.count=40. ILLUMGRID_DISABLE_PLUGINS=1 switches
+    the plugins of other packages off, ILLUMGRID_DISABLE_PLUGINS=NAME,NAME those of these packages.
+    """
+    from illumgrid import registry
+
+    with heard():
+        entries = registry.entries()
+    for number, kind in enumerate(registry.KINDS):
+        typer.echo(f"{chr(10) * bool(number)}{kind}s (--{kind} NAME)")
+        for entry in entries:
+            if entry.kind == kind:
+                typer.echo("\n".join(_lines(entry)))
+        if kind == "backend":
+            typer.echo(f"  {'auto':<12} stands for {registry.auto_backend()}")
+
+
+def _lines(entry: "Entry") -> Iterator[str]:
+    from illumgrid.options import options, short
+
+    cure = entry.missing()
+    state = "" if cure is None else f"; not available here: {cure}"
+    yield f"  {entry.name:<12} {entry.package} {entry.version}{state}"
+    yield f"      {inspect.cleandoc(entry.stage.__doc__ or '').partition(chr(10))[0]}"
+    rows = [(o.name, short(o.type), _shown(o.default), o.meaning) for o in options(entry.stage)]
+    widths = [max((len(row[column]) for row in rows), default=0) for column in range(3)]
+    for row in rows:
+        yield "      " + "  ".join([*(text.ljust(width) for text, width in zip(row, widths)), row[3]]).rstrip()
+
+
+def _shown(default: object) -> str:
+    """A default as it would be typed."""
+    return ",".join(map(str, default)) if isinstance(default, tuple) else str(default)

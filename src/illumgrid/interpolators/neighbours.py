@@ -1,0 +1,162 @@
+"""The samples that a node rests upon: the nearest ones, of both level sets that it lies between."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from illumgrid.grid import GridSpec, IlluminationGrid, fill_holes
+from illumgrid.samples import Samples
+from illumgrid.volume import Floats, world_to_index
+
+_SLAB = 1 << 16  # nodes asked at once: bounds the memory of a search
+_ONE_PLACE = 1e-6  # of a node spacing: samples so close are one
+BETWEEN = 4.0
+"""Cell diagonals from the nearest sample within which a node between two level sets is in reach."""
+
+
+def diagonal(spec: GridSpec) -> float:
+    """Diagonal of a grid cell, a little longer than rounding can make it: the reach of a sample."""
+    return float(np.linalg.norm(spec.spacing)) * (1 + 1e-6)
+
+
+def near_samples(spec: GridSpec, points: Floats, reach: float) -> NDArray[np.bool_]:
+    """Nodes (nx, ny, nz) in whose box of half-width `reach` there may be one of the world points (n, 3)."""
+    from scipy.ndimage import maximum_filter
+
+    taken = np.zeros(spec.shape, bool)
+    closest = np.clip(np.round(world_to_index(spec, points)), 0, np.array(spec.shape) - 1).astype(np.int64)
+    taken[tuple(closest.T)] = True
+    # A point is at most half a node from the one that it is rounded to.
+    width = 2 * np.ceil(reach / spec.spacing + 0.5).astype(int) + 1
+    return np.asarray(maximum_filter(taken, size=tuple(width), mode="constant"))
+
+
+@dataclass(frozen=True, eq=False)
+class Sites:
+    """Places (n, ...) with an answer each.
+
+    Parameters
+    ----------
+    point : (n, 3) float64
+        From the grid's origin, along the world's axes: far from the world's origin, differences would lose digits.
+    normal : (n, 3) float64
+    sheet : (n,) int64
+        0 or 1: neighbouring isovalues of the run differ in it.
+    mean, variance : (n, 3), (n,) float64
+    paths : (n,) float64
+    """
+
+    point: Floats
+    normal: Floats
+    sheet: NDArray[np.int64]
+    mean: Floats
+    variance: Floats
+    paths: Floats
+
+
+def sites(samples: Samples, spec: GridSpec, field: int) -> Sites:
+    """Answers that are no holes; those at one place are merged, each weighted by its paths."""
+    good = samples[samples.paths > 0]
+    point = good.queries.point - spec.origin
+    place = np.round(point / (_ONE_PLACE * spec.spacing.min())).astype(np.int64)
+    order = np.lexsort(place.T)
+    new = np.ones(len(order), bool)
+    new[1:] = (np.diff(place[order], axis=0) != 0).any(axis=1)
+    group = np.zeros(len(order), np.int64)
+    group[order] = np.cumsum(new) - 1
+    first = order[new]
+    count = len(first)
+    paths = good.paths.astype(float)
+    total = np.asarray(np.bincount(group, paths, count), float)
+    share = paths / total[group]
+    mean: Floats = np.stack([np.bincount(group, share * good.mean[:, rgb], count) for rgb in range(3)], axis=1)
+    variance = np.asarray(np.bincount(group, np.square(share * good.error), count), float)
+    levels = np.unique(good.queries.level[:, field])
+    sheet = np.searchsorted(levels, good.queries.level[first, field]) % 2
+    return Sites(point[first], good.queries.normal[first], sheet, mean, variance, total)
+
+
+class Neighbours(NamedTuple):
+    """Sites around nodes in reach: m nodes, k neighbours each, in no order."""
+
+    node: NDArray[np.int64]  # (m,) flat numbers
+    point: Floats  # (m, 3) from the grid's origin
+    site: NDArray[np.int64]  # (m, k)
+    distance: Floats  # (m, k); infinite: none
+    between: NDArray[np.bool_]  # (m,) in front of the nearest site of one sheet, behind that of the other
+
+
+def neighbours(places: Sites, spec: GridSpec, count: int) -> Iterator[Neighbours]:
+    """Up to `count` neighbours of each node in reach: half of each sheet, so that a near one does not hide the other.
+
+    Sites that face away from the nearest one belong to another surface, the back of a slab or the wall across a cleft,
+    whose light is not this one's: they are left out. In reach is a node within a cell's diagonal of a site, or one that
+    lies in front of the nearest site of one sheet and behind that of the other, within `BETWEEN` diagonals.
+    """
+    from scipy.spatial import KDTree
+
+    members = [m for sheet in (0, 1) if len(m := np.flatnonzero(places.sheet == sheet))]
+    trees = [KDTree(places.point[m]) for m in members]
+    each = -(-count // len(members)) if members else count
+    near = diagonal(spec)
+    world = places.point + spec.origin
+    candidates = np.flatnonzero(near_samples(spec, world, BETWEEN * near))
+    for begin in range(0, len(candidates), _SLAB):
+        node = candidates[begin : begin + _SLAB]
+        point = spec.nodes(node) - spec.origin
+        distance, site = np.full((len(node), len(trees), each), np.inf), np.zeros((len(node), len(trees), each), int)
+        for number, (member, tree) in enumerate(zip(members, trees)):
+            asked = range(1, min(each, len(member)) + 1)
+            apart, which = tree.query(point, asked, distance_upper_bound=2 * BETWEEN * near, workers=-1)
+            distance[:, number, : len(asked)] = apart
+            site[:, number, : len(asked)] = member[np.where(np.isfinite(apart), which, 0)]
+        rows = np.arange(len(node))
+        closest = distance[:, :, 0].argmin(axis=1)
+        facing = places.normal[site[rows, closest, 0]]
+        away = np.einsum("mski,mi->msk", places.normal[site], facing) < 0
+        distance[away] = np.inf
+        ahead = distance.argmin(axis=2)
+        first = np.take_along_axis(site, ahead[:, :, None], 2)[:, :, 0]
+        side = np.einsum("msi,msi->ms", point[:, None] - places.point[first], places.normal[first])
+        nearest = np.take_along_axis(distance, ahead[:, :, None], 2)[:, :, 0]
+        between = np.isfinite(nearest).all(axis=1) & (side.min(axis=1) < 0) & (side.max(axis=1) > 0)
+        reached = np.flatnonzero(nearest.min(axis=1) <= near * np.where(between, BETWEEN, 1.0))
+        site, distance = (a.reshape(len(node), -1)[reached] for a in (site, distance))
+        yield Neighbours(node[reached], point[reached], site, distance, between[reached])
+
+
+def filled(
+    samples: Samples,
+    spec: GridSpec,
+    field: int,
+    count: int,
+    weigh: Callable[[Sites, Neighbours], tuple[Floats, Floats]],
+) -> IlluminationGrid:
+    """Grid whose nodes are weighted sums of neighbours.
+
+    Parameters
+    ----------
+    count : int
+        Neighbours of a node.
+    weigh : callable
+        Weights (m, k) that add up to 1, 0 for a missing neighbour, and values (m, 3).
+    """
+    size = int(np.prod(spec.shape))
+    values, error = np.zeros((size, 3), np.float32), np.full(size, np.inf, np.float32)
+    support = np.zeros(size, np.float32)
+    places = sites(samples, spec, field)
+    for around in neighbours(places, spec, count):
+        weight, value = weigh(places, around)
+        values[around.node] = value
+        # As of independent samples. Where one has no error of its own (a single path), the node has none either.
+        spread = np.where(weight != 0, places.variance[around.site], 0.0)
+        square = np.square(weight)
+        error[around.node] = np.sqrt((square * spread).sum(axis=1))
+        support[around.node] = 1 / square.sum(axis=1)
+    shape = tuple(spec.shape)
+    support = support.reshape(shape)
+    values = fill_holes(spec.spacing, values.reshape(*shape, 3), support)
+    return IlluminationGrid(spec, values, error.reshape(shape), support)

@@ -1,0 +1,73 @@
+"""Each node takes the mean of the samples around it, weighted by a smooth kernel."""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from illumgrid.errors import BadInput
+from illumgrid.grid import GridSpec, IlluminationGrid
+from illumgrid.interpolators.neighbours import Neighbours, Sites, filled
+from illumgrid.samples import Samples
+from illumgrid.stages import Interpolator, hookimpl
+from illumgrid.volume import Floats
+
+
+def _kernel_means(places: Sites, around: Neighbours) -> tuple[Floats, Floats]:
+    """Weights of Wendland's kernel on either sheet, the sheets in inverse proportion to their distance, and the means.
+
+    Paths count too, but not the variance: it is estimated from the same paths as the mean, and dark estimates, which
+    vary least, would win.
+    """
+    weight = np.zeros(around.site.shape)
+    sheet = np.where(np.isfinite(around.distance), places.sheet[around.site], -1)
+    nearest = np.stack([np.where(sheet == s, around.distance, np.inf).min(axis=1) for s in (0, 1)], axis=1)
+    # Linear between the sheets; elsewhere the nearer one has all of the node, which is the same on the sheet itself.
+    share = np.where(around.between[:, None], nearest[:, ::-1], nearest == nearest.min(axis=1, keepdims=True))
+    share /= share.sum(axis=1, keepdims=True)
+    for number in (0, 1):
+        there = sheet == number
+        radius = 1.1 * np.where(there, around.distance, 0.0).max(axis=1, keepdims=True)
+        q = np.divide(around.distance, radius, out=np.zeros_like(weight), where=there & (radius > 0))
+        kernel = np.where(there, (1 - q) ** 4 * (4 * q + 1) * places.paths[around.site], 0.0)
+        sums = kernel.sum(axis=1)
+        weight += kernel * np.divide(share[:, number], sums, out=np.zeros_like(sums), where=sums > 0)[:, None]
+    return weight, np.einsum("mk,mki->mi", weight, places.mean[around.site])
+
+
+@dataclass(frozen=True)
+class Splat:
+    """Means of the nearest samples on the two level sets around a node, linear between them.
+
+    The mean on a level set is weighted by a kernel as wide as the samples there are apart.
+
+    Parameters
+    ----------
+    neighbours : int
+        Samples that a node rests upon, at most, half of them on each level set; the farthest of those sets the
+        radius of its kernel.
+
+    References
+    ----------
+    .. [1] D. Shepard, "A two-dimensional interpolation function for irregularly-spaced data", ACM National Conference,
+           1968.
+    .. [2] H. Wendland, "Piecewise polynomial, positive definite and compactly supported radial functions of minimal
+           degree", Advances in Computational Mathematics 4, 1995.
+    """
+
+    name: ClassVar[str] = "splat"
+    neighbours: int = 16
+
+    def __post_init__(self) -> None:
+        if self.neighbours < 1:
+            raise BadInput(f"splat.neighbours is {self.neighbours}; expected at least 1 sample")
+
+    def fill(self, samples: Samples, spec: GridSpec, field: int) -> IlluminationGrid:
+        """Fill every node: see `illumgrid.stages.Interpolator`."""
+        return filled(samples, spec, field, self.neighbours, _kernel_means)
+
+
+@hookimpl
+def register_interpolators() -> list[type[Interpolator]]:
+    """Name this file's stage to the registry, as a plugin does."""
+    return [Splat]
