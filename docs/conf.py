@@ -42,6 +42,10 @@ sphinx_gallery_conf = {
     "capture_repr": (),
 }
 
+live = Path(__file__).parent / "live"  # pages that the gallery writes and the site carries as they are
+live.mkdir(exist_ok=True)
+html_extra_path = ["live"]
+
 html_theme = "pydata_sphinx_theme"
 html_title = "illumgrid"
 html_show_sourcelink = False

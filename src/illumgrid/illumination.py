@@ -79,6 +79,34 @@ class Illumination:
         radiance = self.grids[number].lookup(points) * self.scene.fields[number].material.albedo / np.pi
         return tone.encode_srgb(radiance * (self.exposure if exposure is None else exposure))
 
+    def show(self, isovalue: float | None = None, height: int = 520) -> Any:
+        """View in a notebook: the interactive page, with its isovalue as a synced trait.
+
+        Parameters
+        ----------
+        isovalue : float, optional
+            Of the first field; by default the middle of the range. Later: ``view.isovalue = ...``.
+        height : int
+            Pixels.
+
+        Returns
+        -------
+        anywidget.AnyWidget
+            ``ipywidgets`` can observe and link its trait ``isovalue``.
+
+        Raises
+        ------
+        BadInput
+            If the package anywidget is missing: ``illumgrid[notebook]`` brings it.
+        """
+        from illumgrid.viewer.widget import widget
+
+        return widget(self, isovalue, height)
+
+    def _repr_png_(self) -> bytes:
+        """Still picture, as a notebook shows it."""
+        return preview.png(preview.render(self, width=640, height=480))
+
     def save(self, folder: str | os.PathLike[str], *, preview: bool = True, overwrite: bool = False) -> None:
         """Write a folder that holds everything: see `illumgrid.load`.
 

@@ -13,6 +13,7 @@ from illumgrid.cli.preview import preview
 from illumgrid.cli.run import run
 from illumgrid.cli.told import say
 from illumgrid.cli.verify import verify
+from illumgrid.cli.view import view
 from illumgrid.errors import BadInput
 
 app = typer.Typer(
@@ -22,7 +23,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
-for command in (run, preview, export, info, verify, plugins):
+for command in (run, preview, view, export, info, verify, plugins):
     app.command()(command)
 
 

@@ -1,0 +1,81 @@
+// From the bytes in the page to arrays that the graphics card takes.
+
+const BRICK = 4; // cells along the side of a brick, as in field.frag
+
+export async function unpack(base64) {
+  if (typeof DecompressionStream === "undefined") {
+    throw new Error("This browser cannot unpack the data (no DecompressionStream); any browser since 2023 can.");
+  }
+  const text = atob(base64);
+  const bytes = new Uint8Array(text.length);
+  for (let i = 0; i < text.length; i++) bytes[i] = text.charCodeAt(i);
+  return inflate(bytes);
+}
+
+export async function inflate(bytes) {
+  const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"));
+  return new Uint8Array(await new Response(stream).arrayBuffer());
+}
+
+// Numbers of 16 bits lie as all low bytes, then all high bytes.
+function words(bytes, count) {
+  const result = new Uint16Array(count);
+  for (let i = 0; i < count; i++) result[i] = bytes[i] | (bytes[count + i] << 8);
+  return result;
+}
+
+// Field values: each is written as the difference to its neighbour along x.
+export function fieldValues(bytes, about) {
+  const [nx, ny, nz] = about.shape;
+  const count = nx * ny * nz;
+  const part = bytes.subarray(about.offset, about.offset + count * about.bytes);
+  const values = about.bytes === 1 ? part.slice() : words(part, count);
+  for (let row = 0; row < count; row += nx) {
+    for (let i = row + 1; i < row + nx; i++) values[i] += values[i - 1];
+  }
+  return values;
+}
+
+// Half floats, four a texel; green and blue are written as differences to red.
+export function lightTexels(bytes, about) {
+  const count = about.shape[0] * about.shape[1] * about.shape[2];
+  const channels = [0, 1, 2, 3].map((k) => {
+    const from = about.offset + 2 * count * k;
+    return words(bytes.subarray(from, from + 2 * count), count);
+  });
+  const texels = new Uint16Array(4 * count);
+  for (let i = 0; i < count; i++) {
+    const red = channels[0][i];
+    texels[4 * i] = red;
+    texels[4 * i + 1] = red + channels[1][i];
+    texels[4 * i + 2] = red + channels[2][i];
+    texels[4 * i + 3] = channels[3][i];
+  }
+  return texels;
+}
+
+// Least and largest value over the 5³ voxels of each brick: rays jump over bricks that no level set crosses.
+export function bricks(values, [nx, ny, nz]) {
+  const shape = [nx, ny, nz].map((n) => Math.ceil((n - 1) / BRICK));
+  const result = new Uint16Array(2 * shape[0] * shape[1] * shape[2]);
+  let at = 0;
+  for (let z = 0; z < shape[2]; z++) {
+    for (let y = 0; y < shape[1]; y++) {
+      for (let x = 0; x < shape[0]; x++, at += 2) {
+        let low = 65535, high = 0;
+        for (let k = z * BRICK; k <= Math.min(z * BRICK + BRICK, nz - 1); k++) {
+          for (let j = y * BRICK; j <= Math.min(y * BRICK + BRICK, ny - 1); j++) {
+            const row = nx * (j + ny * k);
+            for (let i = row + x * BRICK; i <= row + Math.min(x * BRICK + BRICK, nx - 1); i++) {
+              if (values[i] < low) low = values[i];
+              if (values[i] > high) high = values[i];
+            }
+          }
+        }
+        result[at] = low;
+        result[at + 1] = high;
+      }
+    }
+  }
+  return { shape, values: result };
+}

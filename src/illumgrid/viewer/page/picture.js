@@ -1,0 +1,251 @@
+// Draws one picture: layers of fields and walls, summed over places within the pixel, then shown.
+
+import { bricks, fieldValues, lightTexels } from "./numbers.js";
+import { dot, eyeOf, facing, sum } from "./camera.js";
+
+export const LOOKS = ["matte", "shiny", "translucent"];
+const LAYERS = 4; // surfaces behind one another that a translucent look shows
+
+function program(gl, vertex, fragment) {
+  const built = gl.createProgram();
+  const head = "#version 300 es\nprecision highp float;\nprecision highp int;\nprecision highp sampler3D;\nprecision highp usampler3D;\n";
+  for (const [kind, text] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]]) {
+    const shader = gl.createShader(kind);
+    gl.shaderSource(shader, head + text);
+    gl.compileShader(shader);
+    gl.attachShader(built, shader);
+  }
+  gl.linkProgram(built);
+  if (!gl.getProgramParameter(built, gl.LINK_STATUS) && !gl.isContextLost()) {
+    const logs = gl.getAttachedShaders(built).map((s) => gl.getShaderInfoLog(s));
+    throw new Error(`The graphics driver refused the page's shaders: ${logs.join(" ")} ${gl.getProgramInfoLog(built)}`);
+  }
+  const at = {};
+  for (let k = 0; k < gl.getProgramParameter(built, gl.ACTIVE_UNIFORMS); k++) {
+    const { name, type } = gl.getActiveUniform(built, k);
+    at[name] = { place: gl.getUniformLocation(built, name), type };
+  }
+  return { built, at };
+}
+
+function set(gl, { at }, values) {
+  const how = {
+    [gl.FLOAT]: (p, v) => gl.uniform1f(p, v),
+    [gl.FLOAT_VEC2]: (p, v) => gl.uniform2fv(p, v),
+    [gl.FLOAT_VEC3]: (p, v) => gl.uniform3fv(p, v),
+    [gl.FLOAT_MAT4]: (p, v) => gl.uniformMatrix4fv(p, false, v),
+  };
+  for (const [name, value] of Object.entries(values)) {
+    if (at[name]) (how[at[name].type] ?? ((p, v) => gl.uniform1i(p, v)))(at[name].place, value);
+  }
+}
+
+export class Picture {
+  constructor(canvas, scene, data, shaders) {
+    this.canvas = canvas;
+    this.scene = scene;
+    const gl = canvas.getContext("webgl2", { alpha: false, antialias: false, powerPreference: "high-performance" });
+    if (!gl) throw new Error("This page draws with WebGL2, which this browser or its graphics driver does not offer.");
+    this.gl = gl;
+    if (!gl.getExtension("EXT_color_buffer_float") && !gl.getExtension("EXT_color_buffer_half_float")) {
+      throw new Error("This page sums light in floating point, which this graphics driver cannot draw into.");
+    }
+    const largest = gl.getParameter(gl.MAX_3D_TEXTURE_SIZE);
+    const sides = scene.fields.flatMap((f) => [...f.values.shape, ...f.light.shape]).concat(scene.atlas?.shape ?? []);
+    if (Math.max(...sides) > largest) {
+      throw new Error(`The volume has ${Math.max(...sides)} voxels along one side; this graphics driver takes at most ${largest}.`);
+    }
+    this.vertices = gl.createVertexArray();
+    gl.bindVertexArray(this.vertices);
+    this.fieldProgram = program(gl, shaders["ray.vert"], shaders["shared.glsl"] + shaders["field.frag"]);
+    this.wallProgram = program(gl, shaders["wall.vert"], shaders["shared.glsl"] + shaders["wall.frag"]);
+    this.copyProgram = program(gl, shaders["ray.vert"], shaders["copy.frag"]);
+    this.fields = scene.fields.map((field) => {
+      const values = fieldValues(data, field.values);
+      const held = bricks(values, field.values.shape);
+      return {
+        values: field.values.bytes === 1
+          ? this.volume(gl.R8UI, gl.RED_INTEGER, gl.UNSIGNED_BYTE, field.values.shape, values, gl.NEAREST)
+          : this.volume(gl.R16UI, gl.RED_INTEGER, gl.UNSIGNED_SHORT, field.values.shape, values, gl.NEAREST),
+        bricks: this.volume(gl.RG16UI, gl.RG_INTEGER, gl.UNSIGNED_SHORT, held.shape, held.values, gl.NEAREST),
+        light: this.light(field.light, data),
+      };
+    });
+    this.walls = scene.atlas ? this.light(scene.atlas, data) : null;
+    this.size = [0, 0];
+  }
+
+  volume(format, layout, type, [nx, ny, nz], values, filter) {
+    const gl = this.gl, texture = gl.createTexture();
+    gl.bindTexture(gl.TEXTURE_3D, texture);
+    gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
+    gl.texStorage3D(gl.TEXTURE_3D, 1, format, nx, ny, nz);
+    gl.texSubImage3D(gl.TEXTURE_3D, 0, 0, 0, 0, nx, ny, nz, layout, type, values);
+    for (const name of ["MIN_FILTER", "MAG_FILTER"]) gl.texParameteri(gl.TEXTURE_3D, gl[`TEXTURE_${name}`], filter);
+    for (const name of ["WRAP_S", "WRAP_T", "WRAP_R"]) gl.texParameteri(gl.TEXTURE_3D, gl[`TEXTURE_${name}`], gl.CLAMP_TO_EDGE);
+    return texture;
+  }
+
+  light(about, data) {
+    const gl = this.gl;
+    return this.volume(gl.RGBA16F, gl.RGBA, gl.HALF_FLOAT, about.shape, lightTexels(data, about), gl.LINEAR);
+  }
+
+  // A place to draw into: half-float colour, and a depth that can be read back.
+  target(width, height, withDepth) {
+    const gl = this.gl, made = { frame: gl.createFramebuffer(), color: gl.createTexture() };
+    gl.bindFramebuffer(gl.FRAMEBUFFER, made.frame);
+    const attach = (texture, format, filter, where) => {
+      gl.bindTexture(gl.TEXTURE_2D, texture);
+      gl.texStorage2D(gl.TEXTURE_2D, 1, format, width, height);
+      for (const name of ["MIN_FILTER", "MAG_FILTER"]) gl.texParameteri(gl.TEXTURE_2D, gl[`TEXTURE_${name}`], filter);
+      for (const name of ["WRAP_S", "WRAP_T"]) gl.texParameteri(gl.TEXTURE_2D, gl[`TEXTURE_${name}`], gl.CLAMP_TO_EDGE);
+      gl.framebufferTexture2D(gl.FRAMEBUFFER, where, gl.TEXTURE_2D, texture, 0);
+    };
+    attach(made.color, gl.RGBA16F, gl.LINEAR, gl.COLOR_ATTACHMENT0);
+    if (withDepth) attach(made.depth = gl.createTexture(), gl.DEPTH_COMPONENT32F, gl.NEAREST, gl.DEPTH_ATTACHMENT);
+    return made;
+  }
+
+  resize(width, height) {
+    if (this.size[0] === width && this.size[1] === height) return;
+    const gl = this.gl;
+    for (const old of [...(this.layers ?? []), this.sum, this.mean]) {
+      if (!old) continue;
+      gl.deleteFramebuffer(old.frame);
+      gl.deleteTexture(old.color);
+      if (old.depth) gl.deleteTexture(old.depth);
+    }
+    this.size = [width, height];
+    this.layers = [this.target(width, height, true), this.target(width, height, true)];
+    this.sum = this.target(width, height, false);
+    this.mean = this.target(width, height, false);
+  }
+
+  bind(unit, kind, texture) {
+    this.gl.activeTexture(this.gl.TEXTURE0 + unit);
+    this.gl.bindTexture(kind, texture);
+    return unit;
+  }
+
+  // All fields and walls nearest to the eye, or nearest behind the layer in front.
+  layer(into, front, seen, state) {
+    const gl = this.gl, { scene } = this;
+    gl.bindFramebuffer(gl.FRAMEBUFFER, into.frame);
+    gl.enable(gl.DEPTH_TEST);
+    gl.disable(gl.BLEND);
+    const translucent = state.look === "translucent" && !state.trust;
+    const empty = translucent ? [0, 0, 0, 0] : [scene.background, scene.background, scene.background, 1];
+    gl.clearColor(...empty);
+    gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
+    const common = {
+      ...seen,
+      uWhite: scene.white,
+      uGain: 2 ** state.stops,
+      uLocalFrom: state.light === "local" ? -1 : state.light === "both" ? state.split * this.size[0] : 1e9,
+      uLook: LOOKS.indexOf(state.look),
+      uTrust: state.trust ? scene.trust : 0,
+      "uScale[0]": scene.trustScale.flat(),
+      uPeel: front ? 1 : 0,
+      uFront: this.bind(3, gl.TEXTURE_2D, front ? front.depth : null),
+    };
+    gl.useProgram(this.fieldProgram.built);
+    set(gl, this.fieldProgram, common);
+    scene.fields.forEach((field, k) => {
+      set(gl, this.fieldProgram, {
+        uField: this.bind(0, gl.TEXTURE_3D, this.fields[k].values),
+        uBricks: this.bind(1, gl.TEXTURE_3D, this.fields[k].bricks),
+        uLight: this.bind(2, gl.TEXTURE_3D, this.fields[k].light),
+        uToIndex: field.toIndex,
+        uToTexture: field.toTexture,
+        uLevel: (this.level(field, state.sweep) - field.values.base) / field.values.step,
+        uAlbedo: field.albedo,
+        uCapTone: scene.capTone,
+        uBothSides: translucent ? 1 : 0,
+      });
+      gl.drawArrays(gl.TRIANGLES, 0, 3);
+    });
+    gl.useProgram(this.wallProgram.built);
+    set(gl, this.wallProgram, { ...common, uLook: 0 });
+    for (const wall of scene.walls) {
+      if (dot(wall.normal, sum([1, seen.uEye], [-1, wall.corner])) <= 0) continue; // a wall seen from behind is not there
+      set(gl, this.wallProgram, {
+        uWalls: this.bind(0, gl.TEXTURE_3D, this.walls),
+        uCorner: wall.corner, uEdgeU: wall.edgeU, uEdgeV: wall.edgeV, uNormal: wall.normal,
+        uTexels: wall.texels, uOffset: wall.offset,
+        uRow: (state.sweep * (scene.atlas.shape[2] - 1) + 0.5) / scene.atlas.shape[2],
+        uAlbedo: wall.albedo, uEmission: wall.emission, uLocalColor: wall.localColor,
+      });
+      gl.drawArrays(gl.TRIANGLE_STRIP, 0, 4);
+    }
+  }
+
+  // Isovalue of a field at this place of the sweep, upwards.
+  level(field, sweep) {
+    return field.upward * ((1 - sweep) * field.range[0] + sweep * field.range[1]);
+  }
+
+  copy(from, into, blend, encode = false) {
+    const gl = this.gl;
+    gl.bindFramebuffer(gl.FRAMEBUFFER, into);
+    gl.disable(gl.DEPTH_TEST);
+    if (blend) {
+      gl.enable(gl.BLEND);
+      blend();
+    } else gl.disable(gl.BLEND);
+    gl.useProgram(this.copyProgram.built);
+    set(gl, this.copyProgram, { uPicture: this.bind(0, gl.TEXTURE_2D, from.color), uEncode: encode ? 1 : 0, uForward: [0, 0, 1], uRight: [1, 0, 0], uUp: [0, 1, 0] });
+    gl.drawArrays(gl.TRIANGLES, 0, 3);
+  }
+
+  // Add one sample to the mean of `count` before it, at a place (0 to 1) within the pixel; `width` x `height` in all.
+  sample(state, width, height, place, count) {
+    const gl = this.gl, { scene } = this;
+    this.resize(width, height);
+    gl.viewport(0, 0, width, height);
+    const { right, up, forward } = facing(state.view, scene.axes);
+    const tall = scene.tangent, wide = (tall * width) / height;
+    const seen = {
+      uEye: eyeOf(state.view, scene.axes),
+      uRight: sum([wide, right]), uUp: sum([tall, up]), uForward: forward,
+      uJitter: [(2 * place[0] - 1) / width, (2 * place[1] - 1) / height],
+      uLamp: sum([-0.72, forward], [0.38, right], [0.58, up]),
+    };
+    let drawn = this.layers[0];
+    this.layer(drawn, null, seen, state);
+    if (state.look === "translucent" && !state.trust) {
+      const under = () => gl.blendFunc(gl.ONE_MINUS_DST_ALPHA, gl.ONE);
+      gl.bindFramebuffer(gl.FRAMEBUFFER, this.sum.frame);
+      gl.clearColor(0, 0, 0, 0);
+      gl.clear(gl.COLOR_BUFFER_BIT);
+      this.copy(drawn, this.sum.frame, under);
+      for (let k = 1; k < LAYERS; k++) {
+        this.layer(this.layers[k % 2], this.layers[(k + 1) % 2], seen, state);
+        this.copy(this.layers[k % 2], this.sum.frame, under);
+      }
+      gl.bindFramebuffer(gl.FRAMEBUFFER, this.layers[0].frame);
+      gl.clearColor(scene.background, scene.background, scene.background, 1);
+      gl.clear(gl.COLOR_BUFFER_BIT);
+      this.copy(this.layers[0], this.sum.frame, under);
+      drawn = this.sum;
+    }
+    const share = 1 / (count + 1);
+    this.copy(drawn, this.mean.frame, count === 0 ? null : () => {
+      gl.blendColor(share, share, share, share);
+      gl.blendFunc(gl.CONSTANT_COLOR, gl.ONE_MINUS_CONSTANT_COLOR);
+    });
+  }
+
+  show() {
+    const gl = this.gl;
+    gl.viewport(0, 0, this.canvas.width, this.canvas.height);
+    this.copy(this.mean, null, null, true);
+  }
+
+  // Wait for the graphics card: what a frame costs is known only then.
+  wait() {
+    const gl = this.gl;
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.mean.frame);
+    gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.FLOAT, new Float32Array(4));
+  }
+}

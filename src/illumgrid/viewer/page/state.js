@@ -1,0 +1,40 @@
+// What the page shows, and the same in its address.
+
+export const DEFAULTS = { sweep: 0.5, light: "global", split: 0.5, stops: 0, look: "matte", trust: false };
+
+const short = (x) => String(Number(x.toPrecision(6)));
+export const clamp = (x, low, high) => Math.min(high, Math.max(low, x));
+export const sweepOf = (field, isovalue) => clamp((isovalue - field.range[0]) / (field.range[1] - field.range[0]), 0, 1);
+export const isovalueOf = (field, sweep) => (1 - sweep) * field.range[0] + sweep * field.range[1];
+
+// "isovalue=0.45&view=0.52,0.31,4.1,0,0,0&light=both": only what is not as the page opens.
+export function written(state, scene) {
+  const parts = [`isovalue=${String(Number(isovalueOf(scene.fields[0], state.sweep).toPrecision(9)))}`];
+  if (state.view.moved) {
+    const { azimuth, elevation, distance, target } = state.view;
+    parts.push(`view=${[azimuth, elevation, distance, ...target].map(short).join(",")}`);
+  }
+  if (state.light !== DEFAULTS.light) parts.push(`light=${state.light}`);
+  if (state.light === "both") parts.push(`split=${short(state.split)}`);
+  if (state.look !== DEFAULTS.look) parts.push(`look=${state.look}`);
+  if (state.stops) parts.push(`stops=${short(state.stops)}`);
+  if (state.trust) parts.push("trust=1");
+  return parts.join("&");
+}
+
+// The part of a state that an address holds; whatever is not understood is left out.
+export function read(address, scene, looks) {
+  const given = new URLSearchParams(address), state = {};
+  const number = (name) => (given.has(name) && given.get(name) !== "" && Number.isFinite(Number(given.get(name))) ? Number(given.get(name)) : null);
+  if (number("isovalue") !== null) state.sweep = sweepOf(scene.fields[0], number("isovalue"));
+  const view = (given.get("view") ?? "").split(",").map(Number);
+  if (view.length === 6 && view.every(Number.isFinite) && view[2] > 0) {
+    state.view = { azimuth: view[0], elevation: clamp(view[1], -1.5533, 1.5533), distance: view[2], target: view.slice(3), moved: true };
+  }
+  if (["global", "local", "both"].includes(given.get("light"))) state.light = given.get("light");
+  if (looks.includes(given.get("look"))) state.look = given.get("look");
+  if (number("split") !== null) state.split = clamp(number("split"), 0, 1);
+  if (number("stops") !== null) state.stops = clamp(number("stops"), -3, 3);
+  if (given.get("trust") === "1") state.trust = true;
+  return state;
+}

@@ -1,0 +1,157 @@
+// The page: a state, the picture of it, and the controls that change it.
+
+import { fitted } from "./camera.js";
+import { listen, listenSplit } from "./hands.js";
+import { LOOKS, Picture } from "./picture.js";
+import { DEFAULTS, clamp, isovalueOf, read, written } from "./state.js";
+import { said, sweeps } from "./sweeps.js";
+
+const REST = 160; // milliseconds without a change: the hand rests
+const SMOOTH = 30; // milliseconds for a frame while the hand moves
+const QUICK = 60; // a frame this quick is refined beyond the four samples of a still picture
+
+// Places within the pixel: first the middles of its four quarters, as in a still picture of the package, then between.
+const PLACES = [[0.25, 0.25], [0.75, 0.75], [0.75, 0.25], [0.25, 0.75]].concat(
+  [...Array(12).keys()].map((k) => [(0.5 + 0.7548777 * (k + 1)) % 1, (0.5 + 0.5698403 * (k + 1)) % 1]),
+);
+
+// Brings `root`, which holds the markup, to life. Options: address (keep the state there), hear (told of every change).
+export function view(root, scene, data, shaders, { address = true, hear = () => {} } = {}) {
+  const part = (name) => root.querySelector(`[data-part="${name}"]`);
+  const canvas = part("canvas"), stage = part("stage");
+  const picture = new Picture(canvas, scene, data, shaders);
+  const state = { ...DEFAULTS };
+  let changed = -Infinity, samples = 0, coarse = 2, asked = false, written_ = "", fresh = true;
+
+  const aspect = () => Math.max(stage.clientWidth, 1) / Math.max(stage.clientHeight, 1);
+  const whole = () => ({ ...fitted(scene.opening, scene.axes, aspect(), scene.tangent), moved: false });
+  state.view = whole();
+
+  const show = sweeps(part("sweeps"), scene.fields, (sweep) => put({ sweep }));
+
+  function controls() {
+    show(state.sweep);
+    for (const choice of root.querySelectorAll("[data-choice]")) {
+      const kind = choice.dataset.choice;
+      for (const input of choice.querySelectorAll("input")) input.checked = input.value === state[kind];
+    }
+    part("effect").hidden = state.look === "matte";
+    part("stops").value = state.stops;
+    part("stopsSaid").value = `${state.stops > 0 ? "+" : state.stops < 0 ? "\u2212" : "\u00b1"}${Math.abs(state.stops).toFixed(1)} EV`;
+    part("trust").checked = state.trust;
+    part("legend").hidden = !state.trust;
+    part("split").hidden = state.light !== "both" || state.trust;
+    part("split").style.left = `${100 * state.split}%`;
+    part("split").setAttribute("aria-valuenow", Math.round(100 * state.split));
+    const isovalues = scene.fields.map((f) => `${f.name} at ${said(f, isovalueOf(f, state.sweep))}`).join(", ");
+    canvas.setAttribute("aria-label", `Isosurface of ${isovalues}, ${state.light} light`);
+  }
+
+  function put(part_) {
+    Object.assign(state, part_);
+    state.sweep = clamp(state.sweep, 0, 1);
+    state.split = clamp(state.split, 0, 1);
+    changed = performance.now();
+    samples = 0;
+    controls();
+    draw();
+    hear(state);
+  }
+
+  function draw() {
+    canvas.setAttribute("aria-busy", "true");
+    if (!asked) requestAnimationFrame(frame);
+    asked = true;
+  }
+
+  function size() {
+    const scale = Math.min(globalThis.devicePixelRatio || 1, 2);
+    const [width, height] = [stage.clientWidth, stage.clientHeight].map((n) => Math.max(1, Math.round(n * scale)));
+    if (canvas.width !== width || canvas.height !== height) {
+      canvas.width = width;
+      canvas.height = height;
+      if (!state.view.moved) state.view = whole();
+      samples = 0;
+    }
+  }
+
+  function frame() {
+    asked = false;
+    size();
+    const moving = !fresh && performance.now() - changed < REST;
+    const begun = performance.now(), divide = moving ? coarse : 1;
+    picture.sample(state, Math.ceil(canvas.width / divide), Math.ceil(canvas.height / divide), moving ? [0.5, 0.5] : PLACES[samples], moving ? 0 : samples);
+    picture.show();
+    picture.wait();
+    const took = performance.now() - begun;
+    view_.took = took;
+    if (moving) {
+      if (took > SMOOTH && coarse < 6) coarse += 1;
+      else if (took < SMOOTH / 3 && coarse > 1) coarse -= 1;
+      draw();
+      return;
+    }
+    samples += 1;
+    fresh = false;
+    if (samples < 4 || (samples < PLACES.length && took < QUICK)) draw();
+    else still();
+  }
+
+  function still() {
+    canvas.setAttribute("aria-busy", "false");
+    if (!address) return;
+    written_ = written(state, scene);
+    try {
+      history.replaceState(null, "", `#${written_}`);
+    } catch { /* a frame without an address of its own */ }
+  }
+
+  function follow() {
+    if (location.hash.slice(1) !== written_) put({ ...DEFAULTS, view: whole(), ...read(location.hash.slice(1), scene, LOOKS) });
+  }
+
+  function save() {
+    picture.show();
+    canvas.toBlob((blob) => {
+      const link = document.createElement("a");
+      link.href = URL.createObjectURL(blob);
+      const isovalue = said(scene.fields[0], isovalueOf(scene.fields[0], state.sweep));
+      link.download = `${scene.fields.map((f) => f.name).join("-").replace(/[^\p{L}\p{N}.-]+/gu, "_")}-${isovalue}.png`;
+      link.click();
+      setTimeout(() => URL.revokeObjectURL(link.href), 1000);
+    });
+  }
+
+  const reset = () => put({ view: whole() });
+  listen(canvas, scene, () => state.view, (next) => put({ view: { ...next, moved: true } }), reset);
+  listenSplit(part("split"), stage, () => state.split, (split) => put({ split }));
+  for (const choice of root.querySelectorAll("[data-choice]")) {
+    choice.addEventListener("change", (event) => put({ [choice.dataset.choice]: event.target.value }));
+  }
+  part("stops").addEventListener("input", () => put({ stops: Number(part("stops").value) }));
+  part("trust").addEventListener("change", () => put({ trust: part("trust").checked }));
+  part("reset").addEventListener("click", reset);
+  part("save").addEventListener("click", save);
+  canvas.addEventListener("webglcontextlost", () => complain(root, "The graphics card was reset. Reload the page to go on."));
+  part("title").textContent = scene.title;
+  part("subtitle").textContent = scene.subtitle;
+  part("worst").textContent = `${Number((100 * scene.trust).toPrecision(2))} % or more`;
+  part("legend").style.setProperty("--scale", `linear-gradient(90deg, ${scene.trustColors.join(", ")})`);
+  part("notes").replaceChildren(...scene.notes.map((text) => Object.assign(document.createElement("p"), { textContent: text })));
+  new ResizeObserver(draw).observe(stage);
+  const view_ = { state, put, picture, took: 0 };
+  if (address) {
+    Object.assign(state, read(location.hash.slice(1), scene, LOOKS));
+    globalThis.addEventListener("hashchange", follow);
+  }
+  controls();
+  draw();
+  return view_;
+}
+
+// A sentence in place of the picture.
+export function complain(root, sentence) {
+  const place = root.querySelector('[data-part="message"]');
+  place.textContent = sentence;
+  place.hidden = false;
+}

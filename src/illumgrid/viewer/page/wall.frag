@@ -1,0 +1,23 @@
+// The front of a wall: its own light texture, (u, v, sweep).
+uniform sampler3D uWalls;
+uniform vec3 uNormal;
+uniform vec2 uTexels, uOffset;       // of this wall, within the texture of all
+uniform float uRow;                  // texture coordinate of the sweep
+uniform vec3 uAlbedo, uEmission;     // emission as the exposure shows it
+uniform vec3 uLocalColor;
+uniform sampler2D uFront;
+uniform bool uPeel;
+
+in vec3 vRay;
+in vec2 vPlace;
+
+void main() {
+  float depth = depthOf(length(vRay));
+  if (uPeel && depth <= texelFetch(uFront, ivec2(gl_FragCoord.xy), 0).r + 1e-6) discard;
+  gl_FragDepth = depth;
+  vec2 texel = uOffset + clamp(vPlace * uTexels, vec2(0.5), uTexels - 0.5);
+  vec3 light = texture(uWalls, vec3(texel / vec2(textureSize(uWalls, 0).xy), uRow)).rgb;
+  if (uTrust > 0.0) { draw(vec3(0.12), 1.0); return; }
+  if (isLocal()) draw(uGain * uWhite * uLocalColor * abs(dot(uNormal, normalize(vRay))), 1.0);
+  else draw(uGain * (uAlbedo * light + uEmission), 1.0);
+}

@@ -1,0 +1,37 @@
+// The same view in a notebook: anywidget hands a model whose traits follow the hand, and lead it.
+
+import { inflate } from "./numbers.js";
+import { complain, view } from "./view.js";
+
+async function render({ model, el }) {
+  const place = document.createElement("div");
+  place.style.cssText = `height: ${model.get("height")}px; container-type: inline-size`;
+  el.append(place);
+  const root = place.attachShadow({ mode: "open" });
+  root.innerHTML = `<style>${model.get("_style")}</style>${model.get("_markup")}`;
+  try {
+    const scene = JSON.parse(model.get("_scene")), held = model.get("_data");
+    const data = await inflate(new Uint8Array(held.buffer, held.byteOffset, held.byteLength));
+    const [low, high] = scene.fields[0].range;
+    const isovalue = (sweep) => (1 - sweep) * low + sweep * high;
+    const near = (a, b) => Math.abs(a - b) < 1e-9 * (high - low);
+    const shown = view(root, scene, data, JSON.parse(model.get("_shaders")), {
+      address: false,
+      hear: (state) => {
+        if (near(model.get("isovalue"), isovalue(state.sweep))) return;
+        model.set("isovalue", isovalue(state.sweep));
+        model.save_changes();
+      },
+    });
+    const lead = () => {
+      if (!near(model.get("isovalue"), isovalue(shown.state.sweep))) shown.put({ sweep: (model.get("isovalue") - low) / (high - low) });
+    };
+    model.on("change:isovalue", lead);
+    lead();
+    return () => model.off("change:isovalue", lead);
+  } catch (error) {
+    complain(root, error.message);
+  }
+}
+
+export default { render };

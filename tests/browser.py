@@ -1,0 +1,158 @@
+"""A real browser without a screen, and small lit scenes for it: what the tests of the page share."""
+
+import base64
+import io
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from illumgrid import preview
+from illumgrid.grid import GridSpec, IlluminationGrid, WallTexture
+from illumgrid.illumination import Illumination
+from illumgrid.preview.camera import fit_camera
+from illumgrid.scene import Field, Material, Scene, box_around, level_table, upright
+from illumgrid.viewer import page
+from illumgrid.viewer.packing import Stage
+from shapes import MIRRORED, ball, sampled
+
+CHROMIUM = next((p for p in ("/usr/bin/chromium", "/usr/bin/chromium-browser") if Path(p).exists()), None)
+ARGS = [
+    "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-quic", "--no-first-run",
+    "--disable-background-networking", "--disable-component-update", "--disable-sync",
+]  # fmt: skip
+WIDTH, HEIGHT = 120, 90
+SMALL = (
+    "addEventListener('DOMContentLoaded', () => document.head.insertAdjacentHTML('beforeend', '<style>"
+    f".viewer {{ display: block !important }} .stage {{ width: {WIDTH}px; height: {HEIGHT}px }}</style>'))"
+)
+
+
+def waves(*shape):
+    """Smooth colours (*shape, 3), different everywhere and along every axis, from 0.4 to 2.4."""
+    place = np.stack(np.meshgrid(*(np.linspace(0, 1, n) for n in shape), indexing="ij"), axis=-1)
+    slopes = np.array([[4.0, 1.1, -1.7], [-1.3, 3.1, 2.3], [2.1, -2.9, 3.7]])
+    return (1.4 + np.sin(place @ slopes + (0.3, 1.0, 2.0))).astype(np.float32)
+
+
+def coloured(scene, nodes=9, rows=3):
+    """Light that differs everywhere, without a run; a sheet of nodes in the first grid are holes."""
+    grids, walls = [], []
+    for field in scene.fields:
+        spec = GridSpec.over(field.volume, nodes)
+        values = waves(*spec.shape)
+        grids.append(IlluminationGrid(spec, values, 0.05 * values[..., 0], np.ones(spec.shape)))
+    grids[0].support[grids[0].spec.shape[0] // 2] = 0
+    for quad in scene.quads:
+        shape = (rows, *quad.texels[::-1])
+        walls.append(WallTexture(waves(*shape), np.ones(shape)))
+    return Illumination(scene, level_table(scene, rows), tuple(grids), tuple(walls), {"seed": 0})
+
+
+def bent(n=(22, 17, 25)):
+    """Mirrored, oblique, uneven, far from the origin; solid below; the solid is cut by the border."""
+    place = {"origin": (900.0, -50.0, 3000.0), "spacing": (0.9, 1.4, 0.8), "direction": MIRRORED}
+    centre = sampled(lambda x: x[:, 0], n, **place)
+    axes = centre.direction * centre.spacing
+    middle = centre.origin + axes @ (np.array(n) / 2)
+
+    def height(x):
+        p = (x - middle) @ centre.direction / 10
+        return (
+            np.linalg.norm(p * (1.0, 0.8, 1.1) - 0.2, axis=1)
+            + 0.15 * np.sin(7 * p[:, 0]) * np.cos(5 * p[:, 1])
+            - 0.3 * p[:, 2]
+        )
+
+    volume = sampled(height, n, **place)
+    return Scene((Field("bent", volume, Material((0.9, 0.6, 0.3)), (0.3, 1.2), "below"),), background=np.ones(3))
+
+
+def pair():
+    """Two fields in a room, of whole numbers and of broken ones."""
+    one, other = ball(18, at=(-0.3, 0, 0.1)), ball(15, at=(0.4, -0.2, -0.3))
+    whole = one.with_values(np.round(3000 * one.values))
+    fields = (
+        Field("one", whole, Material((0.8, 0.4, 0.3)), (2100.0, 3000.0)),
+        Field("other", other, Material((0.3, 0.5, 0.8)), (0.7, 1.0)),
+    )
+    return Scene(fields, box_around(fields[0].volume))
+
+
+def camera_state(scene, camera):
+    """A still picture's camera, as the page's address has it."""
+    right, front, up = upright(scene.fields[0].volume.direction)
+    ahead = camera.forward
+    target = Stage.of(scene).place(camera.eye) + ahead
+    view = [np.arctan2(-ahead @ right, -ahead @ front), np.arcsin(-ahead @ up), 1.0, *target]
+    return ",".join(repr(float(x)) for x in view)
+
+
+TO = """(address) => new Promise((done) => {
+    if (location.hash === `#${address}`) return done();
+    addEventListener('hashchange', () => done(), { once: true });
+    location.hash = address;
+})"""
+
+
+class Browser:
+    """One browser for a module of tests; what it asked for and complained about is kept."""
+
+    def __init__(self, playwright, folder):
+        self.chromium = playwright.chromium.launch(executable_path=CHROMIUM, args=ARGS)
+        self.context = self.chromium.new_context(viewport={"width": 600, "height": 700})
+        self.context.set_default_timeout(120_000)
+        self.context.add_init_script(SMALL)
+        self.folder, self.requests, self.troubles, self.shown = folder, [], [], None
+        self.page = self.context.new_page()
+        self.page.on("request", lambda request: self.requests.append(request.url))
+        self.page.on("pageerror", lambda error: self.troubles.append(str(error)))
+        self.page.on("console", lambda said: self.troubles.append(said.text) if said.type == "error" else None)
+
+    def open(self, light, address="", anew=False):
+        """Show a light at an address: a page that shows it already only gets the address."""
+        if self.shown is light and not anew:
+            self.page.evaluate(TO, address)
+            return self.settle()
+        self.shown = light
+        file = self.folder / f"{light.scene.fields[0].name}.html"
+        if not file.exists():
+            file.write_text(page(light), encoding="utf-8")
+        self.page.goto("about:blank")
+        self.page.goto(f"{file.as_uri()}#{address}")
+        return self.settle()
+
+    def settle(self):
+        self.page.wait_for_function("document.querySelector('canvas').getAttribute('aria-busy') === 'false'")
+        return self.page
+
+    def pixels(self):
+        self.settle()
+        script = "(illumgrid.picture.show(), document.querySelector('canvas').toDataURL())"
+        return decoded(base64.b64decode(self.page.evaluate(script).split(",")[1]))
+
+
+def decoded(file):
+    return np.asarray(Image.open(io.BytesIO(file)).convert("RGB")).astype(int)
+
+
+def still(light, t, local=False):
+    """The software picture at a share of the sweep, the page's address for the same, and where the object is."""
+    scene = light.scene
+    row = scene.levels(t)[0]
+    camera = fit_camera(scene, row, WIDTH / HEIGHT)
+    made = preview.render(light, isovalue=row[0], width=WIDTH, height=HEIGHT, local=local, camera=camera).astype(int)
+    address = f"isovalue={float(row[0])!r}&view={camera_state(scene, camera)}"
+    return made, address, (made != made[0, 0]).any(axis=2)
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory):
+    if CHROMIUM is None:
+        pytest.skip("Chromium is not installed (Debian: apt-get install chromium)")
+    api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed (pip install playwright)")
+    with api.sync_playwright() as playwright:
+        held = Browser(playwright, tmp_path_factory.mktemp("page"))
+        yield held
+        held.chromium.close()

@@ -1,0 +1,101 @@
+"""The view in a notebook: executed by a kernel, and the widget's script led by a model in a browser."""
+
+import base64
+import builtins
+
+import numpy as np
+import pytest
+
+from browser import browser, coloured, pair  # noqa: F401
+from illumgrid.viewer.widget import _widget_class
+from shapes import lit, refused, sky
+
+pytestmark = pytest.mark.filterwarnings("default")  # of Jupyter's packages
+
+CELLS = [
+    """
+import sys
+sys.path.insert(0, "TESTS")
+from browser import coloured, pair
+light = coloured(pair())
+light
+""",
+    "view = light.show(isovalue=2400)\nview",
+    "view.isovalue = 2700\nseen = []\nview.observe(lambda change: seen.append(change.new), 'isovalue')",
+    "view.isovalue = 1e9\nprint(seen, view.range)",
+]
+
+
+def test_a_notebook_shows_a_picture_and_a_view_whose_isovalue_can_be_set(request):
+    nbformat = pytest.importorskip("nbformat")
+    nbclient = pytest.importorskip("nbclient")
+    pytest.importorskip("anywidget")
+    cells = [nbformat.v4.new_code_cell(c.replace("TESTS", str(request.path.parent)).strip()) for c in CELLS]
+    book = nbformat.v4.new_notebook(cells=cells)
+    nbclient.NotebookClient(book, timeout=300, kernel_name="python3").execute()
+    picture = base64.b64decode(book.cells[0].outputs[0].data["image/png"])
+    assert picture.startswith(b"\x89PNG")
+    view = book.cells[1].outputs[0].data["application/vnd.jupyter.widget-view+json"]
+    states = book.metadata.widgets["application/vnd.jupyter.widget-state+json"]["state"]
+    state = states[view["model_id"]]["state"]
+    assert state["isovalue"] == 3000.0  # kept within the range
+    assert state["_anywidget_id"].endswith("View") and "WebGL2" in state["_esm"]
+    assert book.cells[3].outputs[0].text == "[3000.0] (2100.0, 3000.0)\n"
+
+
+def test_the_view_follows_the_model_and_leads_it(browser):  # noqa: F811
+    pytest.importorskip("anywidget")
+    view = coloured(pair()).show(isovalue=2400)
+    traits = {name: getattr(view, name) for name in ("isovalue", "height", "_scene", "_shaders", "_style", "_markup")}
+    page = browser.context.new_page()
+    troubles = []
+    page.on("pageerror", lambda error: troubles.append(str(error)))
+    page.set_content("<div id=here style='width: 160px'></div>")
+    lead = """async ([script, traits, data]) => {
+        const bytes = Uint8Array.from(atob(data), (c) => c.charCodeAt(0)), heard = {};
+        traits._data = new DataView(bytes.buffer);
+        globalThis.model = { get: (k) => traits[k], set: (k, v) => { traits[k] = v },
+            save_changes: () => { model.saved = traits.isovalue },
+            on: (k, f) => { heard[k] = f }, off: () => {},
+            lead: (v) => { traits.isovalue = v; heard['change:isovalue']() } };
+        const module = await import(URL.createObjectURL(new Blob([script], { type: 'text/javascript' })));
+        await module.default.render({ model, el: document.getElementById('here') });
+    }"""
+    page.evaluate(lead, [view._esm, traits | {"height": 140}, base64.b64encode(view._data).decode()])
+    slider = page.locator('input[type="range"]').first
+    assert float(slider.input_value()) == pytest.approx(2400)
+    page.evaluate("model.lead(2850)")
+    assert float(slider.input_value()) == pytest.approx(2850)
+    slider.evaluate("e => { e.value = 2500; e.dispatchEvent(new Event('input', { bubbles: true })) }")
+    assert page.evaluate("model.saved") == pytest.approx(2500)
+    assert "isovalue" not in page.url and not troubles
+    page.close()
+
+
+def test_traits_refuse_what_is_not_a_number_and_keep_to_the_range():
+    traitlets = pytest.importorskip("traitlets")
+    pytest.importorskip("anywidget")
+    view = lit(sky()).show(height=300)
+    assert view.isovalue == pytest.approx(0.6) and view.height == 300
+    view.isovalue = -1
+    assert view.isovalue == 0.3
+    with pytest.raises(traitlets.TraitError, match="finite"):
+        view.isovalue = np.nan
+
+
+def test_without_anywidget_a_sentence_says_what_to_install(monkeypatch):
+    kept = builtins.__import__
+
+    def without(name, *rest):
+        if name == "anywidget":
+            raise ImportError(name)
+        return kept(name, *rest)
+
+    monkeypatch.setattr(builtins, "__import__", without)
+    _widget_class.cache_clear()
+    refused(lambda: lit(sky()).show(), "anywidget", "illumgrid[notebook]")
+    _widget_class.cache_clear()
+
+
+def test_the_repr_is_a_still_picture():
+    assert lit(sky())._repr_png_().startswith(b"\x89PNG")

@@ -1,0 +1,179 @@
+"""The page in a real browser: its pixels are those of the still picture, and hands, keys and addresses move it."""
+
+import numpy as np
+import pytest
+
+from browser import HEIGHT, WIDTH, bent, browser, coloured, decoded, pair, still  # noqa: F401
+
+pytestmark = pytest.mark.filterwarnings("default")  # of the browser's driver
+SCENES = {"bent": coloured(bent()), "pair": coloured(pair())}
+
+
+def alike(one, other):
+    """The same picture, but for outlines, which are refined as far as time allows."""
+    off = np.abs(one - other).max(axis=2)
+    return off.mean() < 1.5 and np.quantile(off, 0.9) <= 4
+
+
+@pytest.mark.parametrize("t, kind", [(0.1, "global"), (0.5, "global"), (0.9, "global"), (0.6, "local")])
+@pytest.mark.parametrize("name", SCENES)
+def test_the_pixels_are_those_of_the_still_picture(browser, name, t, kind):  # noqa: F811
+    light = SCENES[name]
+    wanted, address, covered = still(light, t, local=kind == "local")
+    browser.open(light, f"{address}&light={kind}")
+    off = np.abs(browser.pixels() - wanted).max(axis=2)
+    assert covered.mean() > 0.2
+    # Half floats are good to 0.1 of 255; what is left are outlines, which the page samples up to four times as densely.
+    assert np.median(off[covered]) <= 1 and np.quantile(off[covered], 0.9) <= 3
+    assert np.mean(off[~covered] > 3) < 0.02
+
+
+def test_the_page_opens_at_the_middle_with_the_camera_of_the_still_picture(browser):  # noqa: F811
+    light = SCENES["bent"]
+    wanted, _, covered = still(light, 0.5)
+    browser.open(light)
+    off = np.abs(browser.pixels() - wanted).max(axis=2)
+    assert np.median(off[covered]) <= 1 and np.quantile(off[covered], 0.9) <= 3
+
+
+def test_the_slider_moves_by_hand_and_keys_and_all_fields_follow(browser):  # noqa: F811
+    page = browser.open(SCENES["pair"])
+    before = browser.pixels()
+    first = page.locator('input[type="range"]').first
+    assert first.get_attribute("min") == "2100" and first.get_attribute("max") == "3000"
+    first.evaluate("e => { e.value = 2800; e.dispatchEvent(new Event('input', { bubbles: true })) }")
+    assert np.abs(browser.pixels() - before).max() > 50
+    sliders = page.locator('.sweep input[type="range"]')
+    assert float(sliders.nth(1).input_value()) == pytest.approx(0.7 + 0.3 * 7 / 9)
+    assert page.locator('.sweep input[type="number"]').first.input_value() == "2800"
+    first.focus()
+    for _ in range(3):
+        page.keyboard.press("ArrowRight")
+    browser.settle()
+    moved = float(first.input_value())
+    assert 2800 < moved < 2900 and f"isovalue={moved:.9g}" in page.url
+    page.locator('.sweep input[type="number"]').nth(1).fill("0.85")
+    page.keyboard.press("Enter")
+    assert float(first.input_value()) == pytest.approx(2550)
+
+
+def test_the_address_keeps_the_state(browser):  # noqa: F811
+    page = browser.open(SCENES["pair"], "isovalue=2400&light=both&split=0.3&look=shiny&stops=-1", anew=True)
+    page.locator("canvas").focus()
+    page.keyboard.press("ArrowLeft")
+    page.keyboard.press("+")
+    wanted, address = browser.pixels(), page.url.partition("#")[2]
+    for part in ("isovalue=2400", "light=both", "split=0.3", "look=shiny", "stops=-1", "view="):
+        assert part in address
+    browser.open(SCENES["pair"], address, anew=True)
+    assert alike(browser.pixels(), wanted)
+    browser.open(SCENES["pair"], "isovalue=nonsense&view=1,2&light=moon&look=&split=&stops=inf")
+    assert page.evaluate("[illumgrid.state.sweep, illumgrid.state.light, illumgrid.state.stops]") == [0.5, "global", 0]
+
+
+def test_the_split_shows_global_light_left_of_it_and_local_light_right(browser):  # noqa: F811
+    light = SCENES["bent"]
+    lit, address, _ = still(light, 0.5)
+    local, _, _ = still(light, 0.5, local=True)
+    page = browser.open(light, f"{address}&light=both&split=0.25")
+    handle = page.locator('[data-part="split"]')
+    box = handle.bounding_box()
+    page.mouse.move(box["x"] + box["width"] / 2, box["y"] + 40)
+    page.mouse.down()
+    page.mouse.move(box["x"] + box["width"] / 2 + 0.35 * WIDTH, box["y"] + 45)
+    page.mouse.up()
+    made, cut = browser.pixels(), round(0.6 * WIDTH)
+    assert "split=0.6" in page.url and handle.get_attribute("aria-valuenow") == "60"
+    off = [np.abs(made - want).max(axis=2) for want in (lit, local)]
+    assert np.quantile(off[0][:, : cut - 1], 0.95) <= 3 and np.quantile(off[1][:, cut + 1 :], 0.95) <= 3
+    assert np.mean(off[1][:, : cut - 1] > 20) > 0.02
+    handle.press("End")
+    assert handle.get_attribute("aria-valuenow") == "100"
+
+
+def test_a_drag_turns_the_object_with_the_hand_and_a_double_click_resets(browser):  # noqa: F811
+    page = browser.open(SCENES["pair"])
+    before, box = browser.pixels(), page.locator("canvas").bounding_box()
+    near = page.evaluate("illumgrid.state.view.azimuth")
+    page.mouse.move(box["x"] + 60, box["y"] + 45)
+    page.mouse.down()
+    page.mouse.move(box["x"] + 90, box["y"] + 45)
+    page.mouse.up()
+    assert page.evaluate("illumgrid.state.view.azimuth") < near  # the front goes right: the eye goes left
+    page.mouse.wheel(0, -200)
+    browser.settle()
+    assert "view=" in page.url and np.abs(browser.pixels() - before).max() > 50
+    page.locator("canvas").dblclick()
+    assert alike(browser.pixels(), before) and "view=" not in page.url
+
+
+def test_two_fingers_zoom(browser):  # noqa: F811
+    page = browser.open(SCENES["bent"])
+    zoom = """([moves]) => { const c = document.querySelector('canvas'); c.setPointerCapture = () => {};
+        for (const [kind, pointerId, clientX] of moves) {
+            c.dispatchEvent(new PointerEvent(kind, { pointerId, clientX, clientY: 50, pointerType: 'touch' })); } }"""
+    before = page.evaluate("illumgrid.state.view.distance")
+    page.evaluate(
+        zoom,
+        [
+            [
+                ["pointerdown", 1, 60],
+                ["pointerdown", 2, 90],
+                ["pointermove", 2, 120],
+                ["pointerup", 2, 120],
+                ["pointerup", 1, 60],
+            ]
+        ],
+    )
+    assert page.evaluate("illumgrid.state.view.distance") == pytest.approx(before / 2)
+
+
+def test_a_saved_png_is_the_picture(browser):  # noqa: F811
+    page = browser.open(SCENES["bent"])
+    wanted = browser.pixels()
+    with page.expect_download() as waiting:
+        page.locator('[data-part="save"]').evaluate("e => e.click()")
+    saved = waiting.value
+    assert saved.suggested_filename == "bent-0.750.png"
+    assert np.array_equal(decoded(saved.path().read_bytes()), wanted) and wanted.shape == (HEIGHT, WIDTH, 3)
+
+
+def test_the_trust_view_hatches_holes_and_colours_errors(browser):  # noqa: F811
+    light = SCENES["bent"]
+    page = browser.open(light, "trust=1")
+    made = browser.pixels()
+    assert page.locator('[data-part="legend"]').is_visible()
+    on = made[(np.abs(made - made[0, 0]).max(axis=2) > 12)]
+    grey = np.ptp(on, axis=1) <= 2
+    assert 0.02 < grey.mean() < 0.6  # the sheet of holes
+    assert (on[~grey][:, 2] > on[~grey][:, 0]).any() and (on[~grey][:, 2] < on[~grey][:, 0]).any()  # sure, and not
+
+
+@pytest.mark.parametrize("look", ["shiny", "translucent"])
+def test_a_look_says_that_it_is_an_effect_of_display(browser, look):  # noqa: F811
+    page = browser.open(SCENES["bent"])
+    matte = browser.pixels()
+    assert page.locator('[data-part="effect"]').is_hidden()
+    page.locator(f'input[value="{look}"]').evaluate("e => e.click()")
+    made = browser.pixels()
+    assert "display-time effect" in page.locator('[data-part="effect"]').inner_text()
+    assert np.mean(np.abs(made - matte).max(axis=2) > 4) > 0.02
+
+
+def test_a_browser_without_webgl2_gets_a_sentence(browser):  # noqa: F811
+    from illumgrid.viewer import page as built
+
+    page = browser.context.new_page()
+    page.add_init_script("HTMLCanvasElement.prototype.getContext = () => null")
+    file = browser.folder / "none.html"
+    file.write_text(built(SCENES["bent"]), encoding="utf-8")
+    page.goto(file.as_uri())
+    page.wait_for_function("!document.querySelector('[data-part=message]').hidden")
+    assert "WebGL2" in page.locator('[role="alert"]').inner_text()
+    page.close()
+
+
+def test_nothing_was_asked_of_the_network_and_nothing_went_wrong(browser):  # noqa: F811
+    assert browser.requests
+    assert {url.partition(":")[0] for url in browser.requests} <= {"file", "about", "blob", "data"}
+    assert not browser.troubles

@@ -1,0 +1,176 @@
+"""The page without a browser: its source, what it carries, and how it is served."""
+
+import gzip
+import re
+import threading
+import urllib.error
+import urllib.request
+
+import numpy as np
+import pytest
+
+import illumgrid.viewer.packing as packing
+from browser import bent, coloured, pair
+from illumgrid.levelset import turned
+from illumgrid.viewer import MODULES, SHADERS, compressed, page, script, source
+from illumgrid.viewer.packing import Stage, field_steps, packed, reduced
+from illumgrid.viewer.server import serve
+from illumgrid.volume import Volume, index_to_world
+from shapes import MIRRORED, ball, sampled, sky
+
+LIGHT = coloured(pair())
+
+
+# The source
+
+
+def test_the_source_is_under_60_kb():
+    text = page(LIGHT)
+    carried = re.findall(
+        r'<script type="(?:application/json" id="scene|text/plain" id="data)">(.*?)</script>', text, re.S
+    )
+    assert len(carried) == 2
+    assert len(text.encode()) - sum(map(len, carried)) < 60_000
+
+
+def test_modules_joined_into_one_keep_their_names_apart():
+    for last in ("page", "widget"):
+        text = script(last)
+        named = re.findall(r"^(?:async )?(?:function|const|let|class) (\w+)", text, re.M)
+        assert len(named) == len(set(named)) > 20
+        assert not re.search(r"^import |^export (?!default)", text, re.M)
+
+
+def test_a_module_imports_only_from_those_before_it():
+    for number, name in enumerate(MODULES):
+        taken = re.findall(r'from "\./(\w+)\.js"', source(f"{name}.js"))
+        assert set(taken) <= set(MODULES[:number])
+
+
+def test_the_page_names_no_other_place():
+    text = page(LIGHT)
+    assert not re.search(r"https?:|//\w+\.|@import|url\(", re.sub(r'id="data">.*?</script>', "", text, flags=re.S))
+    assert text.count("<canvas") == 1 and re.search(r'type: "range"|type="range"', text)
+
+
+def test_a_name_cannot_leave_its_place():
+    scene = sky(ball(8), name="</script><b>&")
+    text = page(coloured(scene))
+    assert "</script><b>" not in text and "<title>&lt;/script&gt;&lt;b&gt;&amp;" in text
+
+
+def test_shaders_never_discard_in_the_ray_loop():
+    body = source("field.frag")
+    loop = body[body.index("float march(") : body.index("vec3 gradient(")]
+    assert "discard" not in loop and "discard" in body and len(SHADERS) == 6
+
+
+# What it carries
+
+
+def unpacked(scene, data, part):
+    """Undo the packing of field values as the page does."""
+    (nx, ny, nz), size, start = part["shape"], part["bytes"], part["offset"]
+    count = nx * ny * nz
+    raw = np.frombuffer(data, np.uint8, count * size, start)
+    words = raw if size == 1 else raw[:count] + (raw[count:].astype(np.uint16) << 8)
+    rows = words.reshape(nz, ny, nx)
+    return np.cumsum(rows, axis=2, dtype=rows.dtype).transpose(2, 1, 0)
+
+
+def halves(data, part):
+    count = int(np.prod(part["shape"]))
+    raw = np.frombuffer(data, np.uint8, 8 * count, part["offset"]).reshape(4, 2, count)
+    words = raw[:, 0] + (raw[:, 1].astype(np.uint16) << 8)
+    words[1:3] += words[0]
+    return words.view(np.float16).reshape(4, *part["shape"][::-1]).transpose(3, 2, 1, 0)
+
+
+@pytest.mark.plain
+def test_fields_and_light_come_out_as_they_went_in():
+    scene, data = packed(LIGHT)
+    assert gzip.decompress(compressed(data)) == data and compressed(data) == compressed(data)
+    for about, field, grid in zip(scene["fields"], LIGHT.scene.fields, LIGHT.grids):
+        part = about["values"]
+        back = part["base"] + part["step"] * unpacked(scene, data, part).astype(float)
+        assert np.abs(back - turned(field.volume, field.inside)[0]).max() <= 0.51 * part["step"] * (part["step"] != 1)
+        texels = halves(data, about["light"])
+        lit = grid.values * (LIGHT.exposure / np.pi)
+        np.testing.assert_allclose(texels[..., :3], lit, rtol=5e-4)
+        assert ((texels[..., 3] < 0) == (grid.support == 0)).all()
+    wall = scene["walls"][1]
+    atlas = halves(data, scene["atlas"])[wall["offset"][0] :, : wall["texels"][1]]
+    shown = LIGHT.walls[1].values.transpose(2, 1, 0, 3) * (LIGHT.exposure / np.pi)
+    np.testing.assert_allclose(atlas[: wall["texels"][0], ..., :3], shown, rtol=5e-4)
+
+
+@pytest.mark.plain
+@pytest.mark.parametrize(
+    "values, size, step",
+    [
+        ([0, 7, 255], 1, 1.0),
+        ([-1024, 3071, 5], 2, 1.0),
+        ([0, 65535, 1], 2, 1.0),
+        ([0, 65536, 1], 2, 65536 / 65535),
+        ([0.0, 0.5, 1.0], 2, 1 / 65535),
+        ([2.0**25, 2.0**25 + 4, 2.0**25 + 8], 2, 8 / 65535),
+    ],
+)
+def test_whole_numbers_stay_exact(values, size, step):
+    values = np.array(values, np.float32)
+    steps, base, step_, clamped = field_steps(values, (float(values.min()), float(values.max())))
+    assert steps.dtype.itemsize == size and step_ == pytest.approx(step) and not clamped
+    assert np.abs(base + step_ * steps.astype(float) - values).max() <= (0 if step == 1 else 0.5 * step_)
+
+
+@pytest.mark.plain
+def test_a_narrow_range_in_wide_data_keeps_its_steps():
+    values = np.array([0.0, 0.5, 0.51, 1e6 + 0.5], np.float32)
+    steps, base, step, clamped = field_steps(values, (0.4, 0.6))
+    assert clamped and step * 1000 < 0.2
+    assert np.abs(base + step * steps[:3].astype(float) - values[:3]).max() <= 0.5 * step
+
+
+@pytest.mark.plain
+def test_the_stage_leads_to_the_indices_that_the_world_does():
+    scene = bent()
+    stage, volume = Stage.of(scene), scene.fields[0].volume
+    index = np.random.default_rng(1).random((20, 3)) * 9
+    world = index_to_world(volume, index)
+    place = np.insert(stage.place(world), 3, 1.0, axis=1)
+    np.testing.assert_allclose((place @ stage.to_index(volume).T)[:, :3], index, atol=1e-9)
+    assert np.abs(place[:, :3]).max() <= 0.51
+
+
+def test_what_is_too_large_is_reduced_and_told(monkeypatch):
+    volume = sampled(lambda x: x @ (1.0, 2.0, 3.0), (30, 30, 30), (5, 6, 7), (1, 2, 1), MIRRORED)
+    small = reduced(volume, most=20**3)
+    assert small.shape == (15, 15, 15) and reduced(volume, most=30**3) is volume
+    where = index_to_world(small, np.array([[7.0, 3.0, 11.0]]))[0]  # the middle of a block lies between its voxels
+    assert small.values[7, 3, 11] == pytest.approx(where @ (1.0, 2.0, 3.0), abs=1e-3)
+    assert reduced(Volume(volume.values[:29]), most=20**3).shape == (15, 15, 15)
+    monkeypatch.setattr(packing, "MOST_VOXELS", 12**3)
+    monkeypatch.setattr(packing, "MOST_NODES", 6**3)
+    light = coloured(sky(ball(20)))
+    scene, _ = packed(light)
+    assert scene["fields"][0]["values"]["shape"] == [10, 10, 10] and scene["fields"][0]["light"]["shape"] == [5, 5, 5]
+    assert "20\u2009×\u200920\u2009×\u200920 to 10\u2009×\u200910\u2009×\u200910 voxels" in scene["notes"][0]
+    assert "9\u2009×\u20099\u2009×\u20099 to 5\u2009×\u20095\u2009×\u20095 nodes" in scene["notes"][1]
+
+
+# The server
+
+
+def test_the_server_answers_this_machine_only_and_only_with_the_page():
+    with serve(b"<p>here</p>") as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        assert server.server_address[0] == "127.0.0.1" and server.server_address[1] > 0
+        with urllib.request.urlopen(server.address, timeout=10) as answer:
+            assert answer.read() == b"<p>here</p>" and answer.headers["Content-Type"].startswith("text/html")
+        for address, host, code in ((server.address, "evil.example", 403), (server.address + "etc", None, 404)):
+            asked = urllib.request.Request(address, headers={"Host": host} if host else {})
+            with pytest.raises(urllib.error.HTTPError) as refused:
+                urllib.request.urlopen(asked, timeout=10)
+            assert refused.value.code == code
+            refused.value.close()
+        server.shutdown()
