@@ -27,13 +27,18 @@ def _any_corner(voxels: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return voxels
 
 
+def crossed_cells(field: Field) -> NDArray[np.bool_]:
+    """Voxel cells (nx - 1, ny - 1, nz - 1) through which some level set of the field's range passes."""
+    values = field.volume.values
+    return _any_corner(values >= field.range[0]) & _any_corner(values <= field.range[1])
+
+
 def reachable(field: Field, spec: GridSpec) -> NDArray[np.int64]:
     """Flat numbers of the nodes that a lookup on some isosurface of the field's range can touch.
 
     They are the corners of all grid cells that overlap a voxel cell which some level set within the range crosses.
     """
-    values = field.volume.values
-    crossed = _any_corner(values >= field.range[0]) & _any_corner(values <= field.range[1])
+    crossed = crossed_cells(field)
     for axis in range(3):
         line = np.moveaxis(crossed, axis, 0)
         voxel_cells, grid_cells = len(line), spec.shape[axis] - 1
@@ -45,6 +50,17 @@ def reachable(field: Field, spec: GridSpec) -> NDArray[np.int64]:
     for corner in np.ndindex(2, 2, 2):
         nodes[tuple(slice(c, c + n) for c, n in zip(corner, crossed.shape))] |= crossed
     return np.flatnonzero(nodes)
+
+
+def at_nodes(scene: Scene, field: int, spec: GridSpec, nodes: NDArray[np.integer]) -> Queries:
+    """What `Direct` asks at the nodes with these flat numbers; each has its number as id."""
+    own, points = scene.fields[field], spec.nodes(nodes)
+    isovalues = interpolate(own.volume, world_to_index(own.volume, points))
+    # A rim node stands for the end of the range: light of a level that no sweep reaches would be wrong there (at the
+    # value of an empty background everything is solid, and dark).
+    asked = Queries.at(scene, points, field=field, level=np.clip(isovalues, *own.range))
+    ids = nodes.astype(np.uint64) | np.uint64(field << 40)
+    return Queries(ids, asked.point, asked.normal, asked.level, asked.target)
 
 
 @dataclass(frozen=True)
@@ -62,19 +78,7 @@ class Direct:
         for number, (field, spec) in enumerate(zip(scene.fields, specs)):
             nodes = reachable(field, spec)
             for first in range(0, len(nodes), _BATCH):
-                batch = nodes[first : first + _BATCH]
-                points = spec.nodes(batch)
-                own = interpolate(field.volume, world_to_index(field.volume, points))
-                # A rim node stands for the end of the range: light of a level that no sweep reaches would be wrong
-                # there (at the value of an empty background everything is solid, and dark).
-                asked = Queries.at(scene, points, field=number, level=np.clip(own, *field.range))
-                yield Queries(
-                    batch.astype(np.uint64) | np.uint64(number << 40),
-                    asked.point,
-                    asked.normal,
-                    asked.level,
-                    asked.target,
-                )
+                yield at_nodes(scene, number, spec, nodes[first : first + _BATCH])
 
 
 @hookimpl
