@@ -1,0 +1,100 @@
+"""Who takes part: every sampler with every backend and every interpolator that can be had here."""
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+from illumgrid import registry
+from illumgrid.errors import BadInput
+from illumgrid.samples import Queries
+from illumgrid.scene import Scene
+from illumgrid.stages import Backend, Interpolator, Sampler
+
+COUNTS = (8, 32, 128)
+"""Level sets that a sampler with the option ``count`` tries."""
+
+SLOWEST = 0.02
+"""Share of the budget that a backend may take for 256 queries and 4 paths."""
+
+
+@dataclass(frozen=True)
+class Way:
+    """A way to make samples, and all that may fill the grid from them.
+
+    Parameters
+    ----------
+    sampler : Sampler
+    backend : Backend
+    surface : str
+        What stands for the level sets: "levelset" or "mesh".
+    interpolators : tuple of Interpolator
+    """
+
+    sampler: Sampler
+    backend: Backend
+    surface: str
+    interpolators: tuple[Interpolator, ...]
+
+    def label(self, interpolator: Interpolator) -> str:
+        """Name of a contestant, as the chart shows it."""
+        count = getattr(self.sampler, "count", None)
+        sampler = self.sampler.name if count is None else f"{self.sampler.name} {count}"
+        surface = f" ({self.surface})" if hasattr(self.backend, "surface") else ""
+        return f"{sampler}, {self.backend.name}{surface}, {interpolator.name}"
+
+
+def _stages(kind: str) -> Iterator[Any]:
+    """Every stage of a kind with its default options; what cannot be had here is passed over."""
+    for name in registry.names(kind):
+        try:
+            yield registry.make(kind, name, {})
+        except (BadInput, ImportError):
+            continue
+
+
+def _surfaces(backend: Any) -> Iterator[tuple[Any, str]]:
+    """A backend once for each stand-in for the level sets that it can trace."""
+    if backend.geometry != "both":
+        yield backend, backend.geometry
+    elif hasattr(backend, "surface"):
+        for surface in ("levelset", "mesh"):
+            yield replace(backend, surface=surface), surface
+    else:
+        yield backend, "levelset"
+
+
+def backends(scene: Scene, asked: Queries, budget: float) -> tuple[list[tuple[Any, str]], list[str]]:
+    """Backends with their surfaces, compiled and warm, and sentences about those that are too slow for the budget."""
+    found, notes = [], []
+    few = asked[: min(256, len(asked))]
+    few = few[(few.level == few.level[0]).all(axis=1)]  # a mesh is made for each level set
+    for plain in _stages("backend"):
+        for backend, surface in _surfaces(plain):
+            for _ in range(2):  # compiled and built in the first
+                begun = time.perf_counter()
+                try:
+                    backend.solve(scene, few, paths=range(4), bounces=2, seed=0)
+                except BadInput as reason:
+                    notes.append(f"{backend.name} takes no part: {reason}")
+                    break
+                spent = (time.perf_counter() - begun) * 256 / len(few)
+            else:
+                if spent > SLOWEST * budget:
+                    notes.append(f"{backend.name} takes no part: 256 queries with 4 paths took {spent:.2f} s")
+                else:
+                    found.append((backend, surface))
+    return found, notes
+
+
+def ways(scene: Scene, asked: Queries, budget: float) -> tuple[list[Way], list[str]]:
+    """Every way to make samples here, and why some are missing."""
+    tracers, notes = backends(scene, asked, budget)
+    interpolators = tuple(_stages("interpolator"))
+    found = []
+    for sampler in _stages("sampler"):
+        counts = COUNTS if hasattr(sampler, "count") else (None,)
+        for count in counts:
+            asks = sampler if count is None else replace(sampler, count=count)
+            found += [Way(asks, backend, surface, interpolators) for backend, surface in tracers]
+    return found, notes
