@@ -36,6 +36,8 @@ def draw(records: Sequence[dict[str, Any]], bars: Sequence[Bar], title: str) -> 
 
 def race(axes: "Axes", records: Sequence[dict[str, Any]]) -> None:
     """Seconds against relative error, both logarithmic; the front as a line with the spread over the seeds."""
+    from matplotlib.ticker import LogLocator, NullFormatter
+
     best: dict[str, tuple[bool, float]] = {}
     for r in records:
         before = best.get(r["contestant"], (False, float("inf")))
@@ -54,19 +56,22 @@ def race(axes: "Axes", records: Sequence[dict[str, Any]]) -> None:
                       xerr=[r["seconds_spread"] for r in sure], yerr=[100 * r["rmse_spread"] for r in sure],
                       fmt="none", ecolor="black", elinewidth=1, capsize=2, zorder=4)  # fmt: skip
     labelled(axes, front)
+    axes.margins(0.08)
     axes.set(xscale="log", yscale="log", xlabel="seconds", ylabel="relative RMS error, % of the mean light")
     for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
         axis.set_major_formatter("{x:g}")
+        axis.set_minor_formatter(NullFormatter())
     axes.grid(True, which="both", color="#eeeeee", linewidth=0.8)
     axes.set_axisbelow(True)
-    axes.legend(fontsize=8, loc="upper right", framealpha=0.9)
+    axes.legend(fontsize=8, loc="lower left", framealpha=0.9)  # below the front nobody is
 
 
 def labelled(axes: "Axes", front: Sequence[dict[str, Any]]) -> None:
     """Nodes x paths below the points of the front."""
     for r in front:
         axes.annotate(f"{r['grid']} x {r['paths']}", (r["seconds"], 100 * r["rmse"]), xytext=(-4, -5), fontsize=7,
-                      textcoords="offset points", ha="right", va="top", color="#444444")  # fmt: skip
+                      textcoords="offset points", ha="right", va="top", color="#444444", zorder=5)  # fmt: skip
 
 
 def parts(axes: "Axes", bars: Sequence[Bar]) -> None:
@@ -87,7 +92,13 @@ def parts(axes: "Axes", bars: Sequence[Bar]) -> None:
         axes.bar(place, heights, bottom=base, width=0.85, color=color, label=name)
         base = [b + h for b, h in zip(base, heights)]
     total = [100 * bar.split.total**0.5 for bar in bars]
-    axes.plot(place, total, linestyle="none", marker="_", markersize=16, color="black", label="all of it")
+    reach = [
+        [t - 100 * max(0.0, bar.split.total - bar.split.uncertain) ** 0.5 for t, bar in zip(total, bars)],
+        [100 * (bar.split.total + bar.split.uncertain) ** 0.5 - t for t, bar in zip(total, bars)],
+    ]
+    axes.errorbar(place, total, yerr=reach, fmt="_", markersize=15, color="black", elinewidth=1, capsize=2,
+                  label="all of it, as judged by the truth")  # fmt: skip
+    axes.set_ylim(0, 1.15 * max([*base, *total, 1e-9]))
     axes.set_xticks(place, ticks, fontsize=8)
     for grid in sorted({bar.grid for bar in bars}):
         own = [x for x, bar in zip(place, bars) if bar.grid == grid]

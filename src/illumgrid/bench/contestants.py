@@ -14,8 +14,8 @@ from illumgrid.stages import Backend, Interpolator, Sampler
 COUNTS = (8, 32, 128)
 """Level sets that a sampler with the option ``count`` tries."""
 
-SLOWEST = 0.02
-"""Share of the budget that a backend may take for 256 queries and 4 paths."""
+SLOWEST = 0.005
+"""Share of the budget that a backend may take for 64 queries and 4 paths."""
 
 
 @dataclass(frozen=True)
@@ -29,12 +29,15 @@ class Way:
     surface : str
         What stands for the level sets: "levelset" or "mesh".
     interpolators : tuple of Interpolator
+    denser : Way, optional
+        The same with more level sets, which is tried after this one.
     """
 
     sampler: Sampler
     backend: Backend
     surface: str
     interpolators: tuple[Interpolator, ...]
+    denser: "Way | None" = None
 
     def label(self, interpolator: Interpolator) -> str:
         """Name of a contestant, as the chart shows it."""
@@ -67,7 +70,7 @@ def _surfaces(backend: Any) -> Iterator[tuple[Any, str]]:
 def backends(scene: Scene, asked: Queries, budget: float) -> tuple[list[tuple[Any, str]], list[str]]:
     """Backends with their surfaces, compiled and warm, and sentences about those that are too slow for the budget."""
     found, notes = [], []
-    few = asked[: min(256, len(asked))]
+    few = asked[: min(64, len(asked))]
     few = few[(few.level == few.level[0]).all(axis=1)]  # a mesh is made for each level set
     for plain in _stages("backend"):
         for backend, surface in _surfaces(plain):
@@ -78,23 +81,28 @@ def backends(scene: Scene, asked: Queries, budget: float) -> tuple[list[tuple[An
                 except BadInput as reason:
                     notes.append(f"{backend.name} takes no part: {reason}")
                     break
-                spent = (time.perf_counter() - begun) * 256 / len(few)
+                spent = (time.perf_counter() - begun) * 64 / len(few)
             else:
                 if spent > SLOWEST * budget:
-                    notes.append(f"{backend.name} takes no part: 256 queries with 4 paths took {spent:.2f} s")
+                    notes.append(f"{backend.name} takes no part: 64 queries with 4 paths took {spent:.2f} s")
                 else:
                     found.append((backend, surface))
     return found, notes
 
 
 def ways(scene: Scene, asked: Queries, budget: float) -> tuple[list[Way], list[str]]:
-    """Every way to make samples here, and why some are missing."""
+    """Every way to make samples here, with the fewest level sets each, and why some are missing."""
     tracers, notes = backends(scene, asked, budget)
     interpolators = tuple(_stages("interpolator"))
     found = []
     for sampler in _stages("sampler"):
-        counts = COUNTS if hasattr(sampler, "count") else (None,)
-        for count in counts:
-            asks = sampler if count is None else replace(sampler, count=count)
-            found += [Way(asks, backend, surface, interpolators) for backend, surface in tracers]
+        for backend, surface in tracers:
+            if not hasattr(sampler, "count"):
+                found.append(Way(sampler, backend, surface, interpolators))
+                continue
+            way = None
+            for count in COUNTS[::-1]:
+                way = Way(replace(sampler, count=count), backend, surface, interpolators, way)
+            if way is not None:
+                found.append(way)
     return found, notes

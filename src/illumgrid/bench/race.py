@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from illumgrid.bench.contestants import Way
+from illumgrid.bench.contestants import COUNTS, Way
 from illumgrid.errors import BadInput
 from illumgrid.grid import GridSpec, IlluminationGrid, read_lattice
 from illumgrid.samples import Queries, Samples, combine, join_samples
@@ -190,10 +190,19 @@ class Race:
         lane.stuck = bool(before) and min(now) > 0.9 * min(p.rmse(truth) for p in before)
         lane.rung += 1
         lane.cost = spent * (PATHS[lane.rung] / paths - 1) if lane.rung < len(PATHS) else np.inf
-        if lane.rung == 1 and (finer := [s for s in self.sizes if s > run.grid]):
-            growth = (finer[0] / run.grid) ** 3
-            run = Run(self.scene, run.way, finer[0], self.bounces, self.seed)
-            self.lanes.append(Lane(run, lane.interpolators, 0, spent * growth, lane.lag))
+        if lane.rung == 1:
+            self._unlock(lane, spent)
+
+    def _unlock(self, lane: Lane, spent: float) -> None:
+        """What comes after the first rung of a lane: the next finer grid, and on the coarsest more level sets."""
+        run = lane.run
+        if finer := [size for size in self.sizes if size > run.grid]:
+            ahead = Run(self.scene, run.way, finer[0], self.bounces, self.seed)
+            self.lanes.append(Lane(ahead, lane.interpolators, 0, spent * (finer[0] / run.grid) ** 3, lane.lag))
+        if run.way.denser and run.grid == self.sizes[0]:
+            ahead = Run(self.scene, run.way.denser, run.grid, self.bounces, self.seed)
+            more = COUNTS[1] / COUNTS[0]
+            self.lanes.append(Lane(ahead, lane.interpolators, 0, spent * more, lane.lag))
 
     def _point(self, run: Run, interpolator: Interpolator) -> Point:
         grids, seconds = run.fill(interpolator)

@@ -22,11 +22,11 @@ class Bar:
 
 
 def bars(
-    scene: Scene, backend: Backend, sizes: Sequence[int], bounces: int, seed: int, seconds: float, points: int = 1024
+    scene: Scene, backend: Backend, sizes: Sequence[int], bounces: int, seed: int, seconds: float, points: int = 512
 ) -> list[Bar]:
     """Measure the parts on grids of these sizes, cheapest first, as far as the time goes."""
     begun = time.perf_counter()
-    pilot = Pilot.start(scene, backend, points, 0.01, seed + 1)
+    pilot = Pilot.start(scene, backend, points, 0.004, seed + 1)
     fewer = pilot.fewer(bounces)
     found: list[Bar] = []
     last = 0.0
