@@ -254,11 +254,6 @@ def entry(kind: str, name: str) -> Entry:
     return claims[0]
 
 
-def names(kind: str) -> list[str]:
-    """Names of the stages of this kind, without ``auto``."""
-    return [name for name in _STAGES[kind] if name != "auto"]
-
-
 def option_names(kind: str, name: str) -> list[str]:
     """Options of the stage of this kind and name."""
     return [option.name for option in options.options(entry(kind, name).stage)]

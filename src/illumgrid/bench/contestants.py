@@ -49,11 +49,12 @@ class Way:
 
 def _stages(kind: str) -> Iterator[Any]:
     """Every stage of a kind with its default options; what cannot be had here is passed over."""
-    for name in registry.names(kind):
-        try:
-            yield registry.make(kind, name, {})
-        except (BadInput, ImportError):
-            continue
+    for entry in registry.entries():
+        if entry.kind == kind and entry.missing() is None:
+            try:
+                yield registry.make(kind, entry.name, {})
+            except (BadInput, ImportError):  # two packages claim the name, or something is missing after all
+                continue
 
 
 def _surfaces(backend: Any) -> Iterator[tuple[Any, str]]:
