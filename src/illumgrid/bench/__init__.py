@@ -8,6 +8,7 @@ import numpy as np
 from illumgrid import registry
 from illumgrid.bake import Progress, light_left_out
 from illumgrid.bench.contestants import ways
+from illumgrid.bench.picture import Studio
 from illumgrid.bench.race import SEEDS, Point, Race, front
 from illumgrid.bench.whence import Bar, bars
 from illumgrid.errors import BadInput
@@ -17,8 +18,8 @@ from illumgrid.scene import Scene
 from illumgrid.stages import Backend
 from illumgrid.truth import Truth, begin, converge, enough, unseen_on_level_sets
 
-TRUTH, PARTS = 0.25, 0.12
-"""Shares of the budget for the truth and for the parts of the error."""
+TRUTH, PARTS, PICTURE = 0.25, 0.12, 0.05
+"""Shares of the budget for the truth, the parts of the error and the converged picture."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,9 +117,13 @@ def bench(
     bounces = pilot.bounces_for(0.002)
     most = enough(scene, auto, 2e-4, seed)
     tracers = {way.surface: way.backend for way in entrants[::-1]}
+    tracing = time.perf_counter()
     truths = {surface: begin(scene, tracer, asked, most, seed) for surface, tracer in tracers.items()}
+    pace = (time.perf_counter() - tracing) / (64 * len(asked) * len(tracers))
     truths = {surface: Truth(truth.samples, most, surface) for surface, truth in truths.items() if len(truth)}
     _grown(truths, tracers, scene, seed, 0.002, 0.5 * TRUTH * budget)
+    main = "levelset" if "levelset" in truths else next(iter(truths))
+    studio = Studio.open(scene, tracers[main], truths[main], seed, PICTURE * budget / pace)
     race = Race(scene, truths, [way for way in entrants if way.surface in truths], sizes(scene), bounces, seed)
     racing = (1 - 0.5 * TRUTH - PARTS) * budget
     while lane := race.next(racing - (time.perf_counter() - begun)):
@@ -126,7 +131,7 @@ def bench(
         tell()
     if not race.points:
         raise BadInput("no contestant could finish; " + "; ".join(notes + race.notes))
-    race.repeat(begun + racing, tell)
+    race.repeat(begun + racing, tell, studio)
     smallest = min(p.rmse(truths[p.way.surface]) for p in race.points)
     _grown(truths, tracers, scene, seed, smallest / 5, budget * (1 - PARTS) - (time.perf_counter() - begun))
     parts = bars(scene, auto, sizes(scene), bounces, seed, budget - (time.perf_counter() - begun))

@@ -3,11 +3,13 @@
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from illumgrid.bench.contestants import COUNTS, Way
+from illumgrid.bench.picture import Studio
 from illumgrid.errors import BadInput
 from illumgrid.grid import GridSpec, IlluminationGrid, read_lattice
 from illumgrid.samples import Queries, Samples, combine, join_samples
@@ -35,6 +37,10 @@ class Point:
         One a seed: what the grids hold at the points of the truth.
     covered : (n,) bool
         Points that read only nodes with light of their own.
+    memory : float, optional
+        Megabytes by which the process grew at most, in one run; known on Linux.
+    flip : float, optional
+        Of a picture at an unseen isovalue.
     """
 
     way: Way
@@ -169,7 +175,7 @@ class Race:
         begun = time.perf_counter()
         try:
             run.go_on(paths)
-            new = [self._point(run, interpolator) for interpolator in lane.interpolators]
+            new = [self._point(run, interpolator)[0] for interpolator in lane.interpolators]
         except BadInput as reason:
             self.notes.append(f"{run.way.label(run.way.interpolators[0])}, {run.grid} nodes: {reason}")
             self.lanes.remove(lane)
@@ -204,14 +210,14 @@ class Race:
             more = COUNTS[1] / COUNTS[0]
             self.lanes.append(Lane(ahead, lane.interpolators, 0, spent * more, lane.lag))
 
-    def _point(self, run: Run, interpolator: Interpolator) -> Point:
+    def _point(self, run: Run, interpolator: Interpolator) -> tuple[Point, list[IlluminationGrid]]:
         grids, seconds = run.fill(interpolator)
         asked = self.truths[run.way.surface].samples.queries
         queries = sum(len(a) for a in run.answers)
         point = Point(run.way, interpolator, run.grid, run.paths, queries, covered(grids, asked))
         point.seconds.append(seconds)
         point.light.append(look_up(grids, asked))
-        return point
+        return point, grids
 
     def _lead(self, point: Point) -> float:
         """Least error of anybody who took no longer."""
@@ -237,7 +243,7 @@ class Race:
                 found[key] = point
         return {(*key, point.paths): point.time for key, point in found.items()}
 
-    def repeat(self, deadline: float, tell: Callable[[], None]) -> None:
+    def repeat(self, deadline: float, tell: Callable[[], None], studio: Studio | None = None) -> None:
         """Run what the front consists of with other seeds, until every point on it has enough of them."""
         while ladders := self.front_ladders():
             way, grid, most = min(ladders, key=lambda key: ladders[key])
@@ -247,12 +253,26 @@ class Race:
             fillers = {p.interpolator for p in front(self.points, self.truths)}
             same = [p for p in same if p.interpolator in fillers]
             seed = self.seed + max(len(p.seconds) for p in same if p.paths == most)
-            run = Run(self.scene, same[0].way, grid, self.bounces, seed)
+            run, before = Run(self.scene, same[0].way, grid, self.bounces, seed), resident(reset=True)
             for paths in sorted({p.paths for p in same}):
                 run.go_on(paths)
                 for point in same:
                     if point.paths == paths and len(point.seconds) == seed - self.seed:
-                        again = self._point(run, point.interpolator)
+                        again, grids = self._point(run, point.interpolator)
                         point.seconds += again.seconds
                         point.light += again.light
+                        point.memory = (resident() or 0.0) - before if before else None
+                        if studio and point.flip is None:
+                            point.flip = studio.flip(grids)
             tell()
+
+
+def resident(reset: bool = False) -> float | None:
+    """Megabytes that the process held at most since the last reset; None where the system does not tell."""
+    try:
+        if reset:
+            Path("/proc/self/clear_refs").write_text("5")
+        lines = Path("/proc/self/status").read_text().splitlines()
+        return next(int(line.split()[1]) / 1024 for line in lines if line.startswith("VmHWM"))
+    except (OSError, StopIteration):
+        return None

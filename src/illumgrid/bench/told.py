@@ -62,7 +62,7 @@ def table(records: Sequence[dict[str, Any]]) -> str:
             seen.add(r["contestant"])
             others.append(r)
     wide = max(len(r["contestant"]) for r in records)
-    heads = [f"{head:>8}" for head in ("seconds", "error", "+-", "median", "95 %", "bias")]
+    heads = [f"{head:>8}" for head in ("seconds", "error", "+-", "median", "95 %", "bias", "FLIP", "MB")]
     lines = [f"{'contestant':{wide}} {'grid':>5} {'paths':>6} {' '.join(heads)}"]
     for name, part in (("the front:", sorted(rows, key=lambda r: r["seconds"])), ("the best of the others:", others)):
         if part:
@@ -71,7 +71,9 @@ def table(records: Sequence[dict[str, Any]]) -> str:
             spread = "" if r["rmse_spread"] is None else f"{r['rmse_spread']:.2%}"
             setting = f"{r['contestant']:{wide}} {r['grid']:5} {r['paths']:6} {r['seconds']:8.2f}"
             off = f"{r['rmse']:8.2%} {spread:>8} {r['median']:8.2%} {r['p95']:8.2%} {r['bias']:+8.2%}"
-            lines.append(f"{setting} {off}")
+            flip = "" if r["flip"] is None else f"{r['flip']:.4f}"
+            memory = "" if r["memory_mb"] is None else f"{r['memory_mb']:.0f}"
+            lines.append(f"{setting} {off} {flip:>8} {memory:>8}".rstrip())
     return "\n".join(lines)
 
 
