@@ -14,7 +14,7 @@ from illumgrid.grid import GridSpec
 from illumgrid.samples import Queries
 from illumgrid.scene import Field, Scene
 from illumgrid.stages import Sampler, hookimpl
-from illumgrid.volume import interpolate, world_to_index
+from illumgrid.volume import index_to_world, interpolate, project, world_to_index
 
 _BATCH = 1 << 14
 
@@ -55,10 +55,20 @@ def reachable(field: Field, spec: GridSpec) -> NDArray[np.int64]:
 def at_nodes(scene: Scene, field: int, spec: GridSpec, nodes: NDArray[np.integer]) -> Queries:
     """What `Direct` asks at the nodes with these flat numbers; each has its number as id."""
     own, points = scene.fields[field], spec.nodes(nodes)
-    isovalues = interpolate(own.volume, world_to_index(own.volume, points))
+    index = world_to_index(own.volume, points)
+    isovalues = interpolate(own.volume, index)
     # A rim node stands for the end of the range: light of a level that no sweep reaches would be wrong there (at the
-    # value of an empty background everything is solid, and dark).
-    asked = Queries.at(scene, points, field=field, level=np.clip(isovalues, *own.range))
+    # value of an empty background everything is solid, and dark). A projection goes no farther than a voxel; a node of
+    # a coarser grid goes there over isovalues in between.
+    level = np.clip(isovalues, *own.range)
+    rim = np.flatnonzero(level != isovalues)
+    steps = int(np.ceil((spec.spacing / own.volume.spacing).max() - 1e-9))
+    for step in range(1, steps):
+        between = isovalues[rim] + (level - isovalues)[rim] * step / steps
+        moved, arrived = project(own.volume, index[rim], between)
+        index[rim[arrived]] = moved[arrived]
+    points[rim] = index_to_world(own.volume, index[rim]) if steps > 1 else points[rim]
+    asked = Queries.at(scene, points, field=field, level=level)
     ids = nodes.astype(np.uint64) | np.uint64(field << 40)
     return Queries(ids, asked.point, asked.normal, asked.level, asked.target)
 
