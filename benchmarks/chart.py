@@ -38,8 +38,8 @@ ROOT = Path(__file__).resolve().parents[1]
 BOUNCES = 6
 RANGES = {
     "nucleon.nrrd": (40, 200), "fuel.nrrd": (15, 200), "neghip.nrrd": (30, 180), "hydrogen_atom.nrrd": (12, 80),
-    "stroke_T1.nii.gz": (60, 110), "vis_male.nrrd": (40, 70), "aquarius-A2.nrrd": (60, 150), "betaGal.mrc.gz": (0.05, 0.13),
-    "Bi2O3_ch0.nrrd": (0.05, 0.4), "benzene-homo.nrrd": (0.01, 0.08),
+    "stroke_T1.nii.gz": (60, 110), "vis_male.nrrd": (40, 70), "aquarius-A2.nrrd": (60, 150),
+    "betaGal.mrc.gz": (0.05, 0.13), "Bi2O3_ch0.nrrd": (0.05, 0.4), "benzene-homo.nrrd": (0.01, 0.08),
 }  # fmt: skip
 
 
@@ -92,8 +92,8 @@ def promises(asked):
                     {"field": name, option: value, "ratio": ratio, "rmse": reached, "took": seconds, "plan": plan,
                      "judged": light.recipe["reached"]["rmse"]}
                 )  # fmt: skip
-                print(f"  {name:18} {option} {value:<5} rmse {reached:7.2%} in {seconds:6.1f} s, ratio {ratio:5.2f}, "
-                      f"grid {plan['grid']}, {plan['paths']} paths, {plan['bounces']} bounces, met {plan['met']}")  # fmt: skip
+                chosen = f"grid {plan['grid']}, {plan['paths']} paths, {plan['bounces']} bounces, met {plan['met']}"
+                print(f"  {name:18} {option} {value:<5} {reached:7.2%} in {seconds:6.1f} s, ratio {ratio:5.2f}, {chosen}")
     error = [f["ratio"] for f in found if "error" in f and f["plan"]["met"]]
     seconds = [f["ratio"] for f in found if "seconds" in f and f["plan"]["met"]]
     print(f"  errors within 1.3: {np.mean(np.array(error) <= 1.3):.0%} of {len(error)}; "

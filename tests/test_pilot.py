@@ -40,9 +40,9 @@ def gyroid(n):
 
 
 FIELDS = {
-    "bumps": lambda: Scene.sky(bumps(28, 24, 1, (0.1, 0.2)), range=(0.3, 0.9)),
+    "bumps": lambda: Scene.sky(bumps(22, 24, 1, (0.12, 0.22)), range=(0.3, 0.9)),
     "few bumps": lambda: Scene.sky(bumps(24, 9, 4, (0.12, 0.25)), range=(0.2, 0.7)),
-    "labyrinth": lambda: Scene.sky(gyroid(28), range=(-0.4, 0.4)),
+    "labyrinth": lambda: Scene.sky(gyroid(22), range=(-0.4, 0.4)),
     "on a floor": lambda: Scene.floor(ball(20), range=(0.4, 0.9)),
     "dents": lambda: Scene.sky(bumps(24, 10, 7), range=(0.4, 1.0), inside="below"),
 }
@@ -57,8 +57,8 @@ def truths():
     made = {}
     for name, make in FIELDS.items():
         scene = make()
-        asked = unseen_on_level_sets(scene, 24, 2400, seed=50)
-        made[name] = scene, converge(begin(scene, BACKEND, asked, 64, seed=50), scene, BACKEND, 50, 0.004, 1024)
+        asked = unseen_on_level_sets(scene, 16, 1600, seed=50)
+        made[name] = scene, converge(begin(scene, BACKEND, asked, 16, seed=50), scene, BACKEND, 50, 0.01, 128)
     return made
 
 
@@ -86,7 +86,7 @@ def test_unseen_points_differ_from_seed_to_seed_and_the_truth_walks_other_paths(
 def test_corners_hold_exactly_what_a_lookup_in_the_built_grid_reads():
     scene = FIELDS["bumps"]()
     asked = unseen_in_volume(scene, 300, 0)
-    for nodes in (9, 28, 41):
+    for nodes in (9, 22, 31):
         light = run(scene, grid=nodes, paths=8, bounces=2, seed=5)
         around = corners(scene, nodes, asked)
         read, covered = around.read(BACKEND.solve(scene, around.asked, paths=range(8), bounces=2, seed=5))
@@ -122,7 +122,7 @@ def test_the_split_finds_parts_that_were_put_in():
 
 def test_the_measured_noise_is_that_of_two_built_grids():
     scene, nodes = FIELDS["few bumps"](), 24
-    pilot = Pilot.start(scene, BACKEND, 3000, 0.02, 0)
+    pilot = Pilot.start(scene, BACKEND, 1500, 0.05, 0)
     found = pilot.measure(nodes, pilot.fewer(3), 3, 16)
     one, other = (
         look_up(run(scene, grid=nodes, paths=16, bounces=3, seed=s).grids, pilot.truth.samples.queries) for s in (8, 9)
