@@ -70,7 +70,7 @@ def test_a_race_goes_from_cheap_to_dear_and_keeps_its_seeds(truth):
     race = Race(
         scene, {"levelset": exact}, [WAY, Way(Uniform(8), BACKEND, "levelset", (Nearest(),), denser)], [4, 7], 3, 0
     )
-    while lane := race.next(3.0):
+    while lane := race.next(np.inf):
         race.step(lane)
         assert len(race.points) < 60
     assert {p.label for p in race.points} >= {"direct, numba, nearest", "uniform 8, numba, nearest"}
@@ -111,7 +111,8 @@ def test_everything_that_is_registered_takes_part_or_is_told(truth):
     chain = next(w for w in entrants if w.sampler.name == "uniform")
     assert chain.sampler.count == COUNTS[0] and chain.denser.sampler.count == COUNTS[1]
     few, notes = ways(scene, exact.samples.queries, 1e-6)
-    assert not few and any("reference takes no part: 64 queries" in note for note in notes)
+    assert {w.backend.name for w in few} == {"numba"}  # the fastest is never too slow
+    assert any("reference takes no part: 64 queries" in note for note in notes)
 
 
 def test_the_advice_names_the_fastest_that_is_good_enough_and_what_is_missing(truth):

@@ -5,6 +5,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
+
 from illumgrid import registry
 from illumgrid.errors import BadInput
 from illumgrid.samples import Queries
@@ -69,25 +71,30 @@ def _surfaces(backend: Any) -> Iterator[tuple[Any, str]]:
 
 
 def backends(scene: Scene, asked: Queries, budget: float) -> tuple[list[tuple[Any, str]], list[str]]:
-    """Backends with their surfaces, compiled and warm, and sentences about those that are too slow for the budget."""
-    found, notes = [], []
+    """Backends with their surfaces, compiled and warm, and sentences about those that are too slow for the budget.
+
+    The fastest one is never too slow.
+    """
+    took: list[tuple[float, Any, str]] = []
+    notes = []
     few = asked[: min(64, len(asked))]
-    few = few[(few.level == few.level[0]).all(axis=1)]  # a mesh is made for each level set
+    few = few[np.flatnonzero((few.level == few.level[0]).all(axis=1))]  # a mesh is made for each level set
     for plain in _stages("backend"):
         for backend, surface in _surfaces(plain):
-            for _ in range(2):  # compiled and built in the first
-                begun = time.perf_counter()
-                try:
+            try:
+                for _ in range(2):  # compiled and built in the first
+                    begun = time.perf_counter()
                     backend.solve(scene, few, paths=range(4), bounces=2, seed=0)
-                except BadInput as reason:
-                    notes.append(f"{backend.name} takes no part: {reason}")
-                    break
-                spent = (time.perf_counter() - begun) * 64 / len(few)
-            else:
-                if spent > SLOWEST * budget:
-                    notes.append(f"{backend.name} takes no part: 64 queries with 4 paths took {spent:.2f} s")
-                else:
-                    found.append((backend, surface))
+            except BadInput as reason:
+                notes.append(f"{backend.name} takes no part: {reason}")
+                continue
+            took.append(((time.perf_counter() - begun) * 64 / len(few), backend, surface))
+    found = []
+    for spent, backend, surface in took:
+        if spent <= max(SLOWEST * budget, min(took, key=lambda t: t[0])[0]):
+            found.append((backend, surface))
+        else:
+            notes.append(f"{backend.name} takes no part: 64 queries with 4 paths took {spent:.2f} s")
     return found, notes
 
 
