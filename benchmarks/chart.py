@@ -92,8 +92,9 @@ def promises(asked):
                     {"field": name, option: value, "ratio": ratio, "rmse": reached, "took": seconds, "plan": plan,
                      "judged": light.recipe["reached"]["rmse"]}
                 )  # fmt: skip
-                chosen = f"grid {plan['grid']}, {plan['paths']} paths, {plan['bounces']} bounces, met {plan['met']}"
-                print(f"  {name:18} {option} {value:<5} {reached:7.2%} in {seconds:6.1f} s, ratio {ratio:5.2f}, {chosen}")
+                chosen = f"grid {plan['grid']}, {plan['paths']} paths, met {plan['met']}"
+                came = f"{reached:7.2%} in {seconds:6.1f} s, ratio {ratio:5.2f}"
+                print(f"  {name:18} {option} {value:<5} {came}, {chosen}")
     error = [f["ratio"] for f in found if "error" in f and f["plan"]["met"]]
     seconds = [f["ratio"] for f in found if "seconds" in f and f["plan"]["met"]]
     print(f"  errors within 1.3: {np.mean(np.array(error) <= 1.3):.0%} of {len(error)}; "

@@ -173,12 +173,11 @@ def test_bench_writes_what_it_says_whole_and_once(call, tmp_path):
     found = json.loads((tmp_path / "b" / "bench.json").read_text())
     assert found["truth"]["levelset"]["points"] >= 1000 and found["truth"]["levelset"]["isovalues"] >= 8
     assert found["parts"] and found["advice"] and found["bounces"] >= 0
-    rows = list(csv.DictReader((tmp_path / "b" / "bench.csv").open()))
+    rows = list(csv.DictReader((tmp_path / "b" / "bench.csv").read_text().splitlines()))
     assert (
         len(rows) == len(found["points"]) and {"seconds", "rmse", "bias", "p95", "flip", "memory_mb"} <= rows[0].keys()
     )
     assert "--overwrite" in call(*arguments, code=2)
-    call(*arguments, "--overwrite")
 
 
 def test_bench_refuses_before_anything_runs(refuse, tmp_path):
