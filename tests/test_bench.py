@@ -8,9 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from illumgrid import store
 from illumgrid.backends.numba_ import Numba
-from illumgrid.bench import _remarks, bench, chart, report, told
+from illumgrid.bench import _remarks, bench, chart, told
 from illumgrid.bench import sizes as sizes_of
 from illumgrid.bench.contestants import COUNTS, Way, ways
 from illumgrid.bench.race import Point, Race, Run, covered, front
@@ -169,7 +168,7 @@ def test_bench_writes_what_it_says_whole_and_once(call, tmp_path):
     arguments = ("bench", "v.npy", "--range", 0.3, 0.9, "--budget", 4, "-o", "b")
     said = call(*arguments)
     assert "the front:" in said and "for 10% use --sampler" in said and "wrote b" in said
-    assert sorted(p.name for p in (tmp_path / "b").iterdir()) == sorted(report.FILES)
+    assert sorted(p.name for p in (tmp_path / "b").iterdir()) == ["bench.csv", "bench.json", "chart.png", "chart.svg"]
     found = json.loads((tmp_path / "b" / "bench.json").read_text())
     assert found["truth"]["levelset"]["points"] >= 1000 and found["truth"]["levelset"]["isovalues"] >= 8
     assert found["parts"] and found["advice"] and found["bounces"] >= 0
@@ -177,7 +176,7 @@ def test_bench_writes_what_it_says_whole_and_once(call, tmp_path):
     assert (
         len(rows) == len(found["points"]) and {"seconds", "rmse", "bias", "p95", "flip", "memory_mb"} <= rows[0].keys()
     )
-    assert "--overwrite" in call(*arguments, code=2)
+    assert "new folder" in call(*arguments, code=2)
 
 
 def test_bench_refuses_before_anything_runs(refuse, tmp_path):
@@ -185,20 +184,7 @@ def test_bench_refuses_before_anything_runs(refuse, tmp_path):
     refuse("bench", "v.npy", "--budget", 0, words=["budget"])
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "notes.txt").write_text("mine")
-    refuse("bench", "v.npy", "-o", "mine", words=["notes.txt"])
-
-
-def test_files_are_put_whole_or_not_at_all(tmp_path, monkeypatch):
-    files = {"a.json": b"1", "b.csv": b"2"}
-    store.write_files(tmp_path / "new", files, False)
-    assert (tmp_path / "new" / "a.json").read_bytes() == b"1"
-    refused(lambda: store.write_files(tmp_path / "new", files, False), "--overwrite")
-    store.write_files(tmp_path / "new", {"a.json": b"3"} | files, True)
-    (tmp_path / "file").write_text("x")
-    refused(lambda: store.write_files(tmp_path / "file", files, True), "not a folder")
-    monkeypatch.setattr("pathlib.Path.write_bytes", lambda *_: (_ for _ in ()).throw(OSError(28, "No space left")))
-    refused(lambda: store.write_files(tmp_path / "other", files, False), "No space left")
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["file", "new"]
+    refuse("bench", "v.npy", "-o", "mine", words=["mine", "new folder"])
 
 
 def test_run_tells_the_error_that_it_reached_and_what_it_chose(call, tmp_path):

@@ -16,8 +16,6 @@ from illumgrid.scene import Scene
 if TYPE_CHECKING:
     from illumgrid.bench import Report
 
-FILES = ("bench.json", "bench.csv", "chart.png", "chart.svg")
-
 
 def files(report: "Report", name: str, scene: Scene) -> tuple[dict[str, bytes], str]:
     """Content of every file, and the text for the terminal."""

@@ -25,7 +25,6 @@ def bench(
         float | None, typer.Option(min=0.0, metavar="SIGMA", help="Gaussian blur in voxels before anything else.")
     ] = None,
     seed: Annotated[int, typer.Option(min=0, max=2**64 - 1, metavar="N", help="Of the contestants and the truth.")] = 0,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an earlier chart in DIR.")] = False,
 ) -> None:
     """Chart seconds against error for everything that is registered, and say which setting to use.
 
@@ -38,12 +37,12 @@ def bench(
 
     given = _input(source, None, limits, None, None)
     folder = output or Path(f"{given.name}-bench")
-    store.claim_files(folder, report.FILES, overwrite)
+    store.claim_new(folder)
     with heard():
         scene = given.make(smooth or 0.0)
         with told_progress() as progress:
             found = benches.bench(scene, budget, seed, progress)
         files, told = report.files(found, given.name, scene)
-    store.write_files(folder, files, overwrite)
+    store.write_folder(folder, iter(files.items()))
     typer.echo(told)
     say(f"wrote {folder}; look at {folder / 'chart.png'}")
