@@ -17,7 +17,7 @@ from illumgrid.demo import nucleus
 from illumgrid.preview import fit_camera, render, widest_row
 
 scene = nucleus()
-light = ig.run(scene, grid=32, paths=48, isovalues=6)
+light = ig.run(scene, grid=28, paths=48, isovalues=5)
 
 # %%
 # **What to look for:** the shadows on the walls, and the red and green that the walls throw back, follow the surfaces

@@ -63,23 +63,25 @@ def preview(
     _check(output, sweep, isovalue, local, trust, split, grid_volume, cut)
     drawn_by, why = pictures.choose_engine(engine)
     light = load(folder)
-    if engine == "auto":
-        say(f"engine: {drawn_by} ({why})")
     options: dict[str, Any] = {"view": view, "zoom": zoom, "background": background, "engine": drawn_by, "trust": trust}
     if size != (960, 720):
         options |= {"width": size[0], "height": size[1]}
     if sweep is not None:
         _sweep(light, field, sweep, local, split, options)
-        return
-    assert output is not None
-    if grid_volume:
-        del options["trust"]
-        picture = pictures.grid_volume(light, field, cut=cut, **options)
+        wrote = f"wrote {sweep[1]}, {sweep[0]} isovalues"
     else:
-        _told_outside(light, field, isovalue)
-        picture = _drawn(light, field, local, split, options)(isovalue)
-    store.write_file(output, pictures.png(picture))
-    say(f"wrote {output}" + ("" if local or trust else f" at exposure {light.exposure:.4g}"))
+        assert output is not None
+        if grid_volume:
+            del options["trust"]
+            picture = pictures.grid_volume(light, field, cut=cut, **options)
+        else:
+            _told_outside(light, field, isovalue)
+            picture = _drawn(light, field, local, split, options)(isovalue)
+        store.write_file(output, pictures.png(picture))
+        wrote = f"wrote {output}"
+    say(wrote + ("" if local or trust else f" at exposure {light.exposure:.4g}"))
+    if engine == "auto":
+        say(f"drawn by the engine {drawn_by}: {why}")
 
 
 def _check(
@@ -163,4 +165,3 @@ def _sweep(
             store.write_file(path, film(list(told()), path.suffix.lower()))
         else:
             store.write_folder(path, ((f"{number:04}.png", png(picture)) for number, picture in enumerate(told())))
-    say(f"wrote {path}, {count} isovalues" + ("" if local else f" at exposure {light.exposure:.4g}"))
