@@ -265,4 +265,3 @@ def test_the_list_of_plugins_shows_options_origins_and_what_is_missing(install, 
     ):
         assert words in said, said
     assert call("run", "v.npy", "--sampler", "mine", "-o", "out", code=2).count("pip install ray") == 1
-

@@ -26,6 +26,7 @@ WARNINGS = {
     "empty": "isovalues of the range that have no surface",
     "anisotropy": "voxels much longer along one axis than along another",
     "range": "a range that goes beyond the data",
+    "grid": "light that the grid cannot hold between its nodes, whatever the paths",
     "holes": "nodes within the range that got no light of their own",
 }
 """Names of all warnings, and what each is about."""

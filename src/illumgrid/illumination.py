@@ -14,6 +14,7 @@ from illumgrid import preview, registry, store, tone
 from illumgrid.bake import Map, Progress, bake, enough_bounces, light_left_out
 from illumgrid.errors import BadInput, tell
 from illumgrid.grid import GridSpec, IlluminationGrid, WallTexture
+from illumgrid.plan import judge, planned
 from illumgrid.scene import Levels, Scene, level_table
 from illumgrid.stages import Backend, Interpolator, Sampler
 from illumgrid.volume import Volume
@@ -151,10 +152,12 @@ def run(
     backend: str | Backend = "auto",
     interpolator: str | Interpolator = "nearest",
     grid: int | None = None,
-    paths: int = 64,
+    paths: int | None = None,
     bounces: int | None = None,
     isovalues: int | None = None,
     seed: int = 0,
+    error: float | None = None,
+    seconds: float | None = None,
     map: Map = map,
     progress: Progress = lambda what, done, total: None,
 ) -> Illumination:
@@ -167,8 +170,8 @@ def run(
         Names, or stage objects such as ``illumgrid.sampler("uniform", count=64)``.
     grid : int, optional
         Nodes along the axis with most voxels; by default as many as voxels, at most 128.
-    paths : int
-        Light paths from every query.
+    paths : int, optional
+        Light paths from every query; by default 64.
     bounces : int, optional
         Reflections; 0 is light straight from background and lamps. By default 4 under an open sky, and in a closed
         scene as many as leave out less than 1 % of the light.
@@ -176,6 +179,12 @@ def run(
         Rows of the level table, 32 by default; if given, also the count of a sampler that is named and has one.
     seed : int
         Equal seeds give bit-identical grids, on any number of threads.
+    error : float, optional
+        Relative root mean square error to reach: a short pilot chooses `grid`, `paths` and `bounces`, as far as they
+        are not given, for the least time. Needs the sampler `direct`, the interpolator `nearest` and a backend that
+        marches level sets, whose error is known before the grid is built.
+    seconds : float, optional
+        In place of `error`: time to use, for the least error.
     map : callable, optional
         What spreads the work: see `illumgrid.bake.bake`.
     progress : callable, optional
@@ -195,7 +204,7 @@ def run(
     IllumgridWarning
         When nodes within the range are holes.
     """
-    if paths < 1:
+    if paths is not None and paths < 1:
         raise BadInput(f"{paths} paths were asked for; expected at least 1")
     if bounces is not None and bounces < 0:
         raise BadInput(f"{bounces} bounces were asked for; expected 0 (light straight from the lamps) or more")
@@ -206,6 +215,16 @@ def run(
     if isovalues is not None and isinstance(sampler, str) and "count" in registry.option_names("sampler", sampler):
         options["count"] = isovalues
     chosen = _stage("sampler", sampler, options), _stage("backend", backend), _stage("interpolator", interpolator)
+    plan = None
+    if error is not None or seconds is not None:
+        _check_plannable(error, seconds, *chosen)
+        progress("pilot", 0, 1)
+        plan = planned(
+            scene, chosen[1], levels, error=error, seconds=seconds, grid=grid, paths=paths, bounces=bounces, seed=seed
+        )
+        progress("pilot", 1, 1)
+        grid, paths, bounces = plan.grid, plan.paths, plan.bounces
+    paths = 64 if paths is None else paths
     specs = [nodes_over(field.volume, grid) for field in scene.fields]
     if bounces is None:
         bounces, left_out = enough_bounces(scene, chosen[1], seed)
@@ -234,9 +253,26 @@ def run(
         "holes": list(baked.holes),
         "seconds": {stage: round(seconds, 3) for stage, seconds in baked.seconds.items()},
         "relative_error": _relative_error(baked.grids),
+        "plan": None if plan is None else asdict(plan),
+        "reached": None if plan is None else asdict(judge(scene, chosen[1], baked.grids, seed)),
         "versions": {name: version(name) for name in ("illumgrid", "numpy", "numba", "scipy")},
     }
     return Illumination(scene, levels, baked.grids, baked.walls, recipe)
+
+
+def _check_plannable(error: float | None, seconds: float | None, sampler: Any, backend: Any, interpolator: Any) -> None:
+    """Refuse what no pilot can plan for."""
+    if error is not None and seconds is not None:
+        raise BadInput("both an error and a time were asked for; expected one of them")
+    if error is not None and not 0 < error < 1:
+        raise BadInput(f"an error of {error:g} was asked for; expected a share of the mean light, such as 0.03")
+    if seconds is not None and not 0 < seconds < np.inf:
+        raise BadInput(f"{seconds:g} seconds were asked for; expected a positive number")
+    if (sampler.name, interpolator.name) != ("direct", "nearest") or backend.geometry == "mesh":
+        raise BadInput(
+            f"an error or a time was asked for with {sampler.name}, {backend.name} and {interpolator.name}; expected "
+            "direct, a backend that marches level sets, and nearest: 'illumgrid bench' measures the others"
+        )
 
 
 def _relative_error(grids: tuple[IlluminationGrid, ...]) -> list[float | None]:

@@ -362,6 +362,13 @@ def write_file(path: str | os.PathLike[str], content: bytes) -> None:
         fresh.write_bytes(content)
 
 
+def claim_new(path: str | os.PathLike[str]) -> None:
+    """Raise BadInput if something is at `path` already, but for an empty folder."""
+    place = Path(os.path.abspath(path))
+    if place.exists() and not (place.is_dir() and not any(place.iterdir())):
+        raise BadInput(f"{path} is there already; expected the name of a new folder: choose another")
+
+
 def write_folder(path: str | os.PathLike[str], files: Iterator[tuple[str, bytes]]) -> None:
     """Write named files into a new folder beside its place and rename it: whole, or not there.
 
@@ -370,9 +377,8 @@ def write_folder(path: str | os.PathLike[str], files: Iterator[tuple[str, bytes]
     BadInput
         If something is there already, before the first file is asked for; or if it cannot be written.
     """
+    claim_new(path)
     place = Path(os.path.abspath(path))
-    if place.exists() and not (place.is_dir() and not any(place.iterdir())):
-        raise BadInput(f"{path} is there already; expected the name of a new folder: choose another")
     with _sentences(f"{path} could not be written", "choose another place"):
         place.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=f".{place.name[:50]}-", dir=place.parent) as work:

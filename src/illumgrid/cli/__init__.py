@@ -6,6 +6,7 @@ from typing import Annotated, Any
 
 import typer
 
+from illumgrid.cli.bench import bench
 from illumgrid.cli.export import export
 from illumgrid.cli.info import info
 from illumgrid.cli.plugins import plugins
@@ -23,7 +24,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
-for command in (run, preview, view, export, info, verify, plugins):
+for command in (run, preview, view, export, info, bench, verify, plugins):
     app.command()(command)
 
 

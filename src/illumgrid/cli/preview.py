@@ -33,6 +33,9 @@ def preview(
     local: Annotated[
         bool, typer.Option("--local", help="A lamp at the camera in place of the computed light.")
     ] = False,
+    trust: Annotated[
+        bool, typer.Option("--trust", help="In place of light, how sure it is: its relative error bar, and the holes.")
+    ] = False,
     split: Annotated[bool, typer.Option("--split", help="Both side by side: local left, global right.")] = False,
     grid_volume: Annotated[
         bool, typer.Option("--grid-volume", help="The illumination grid itself, as a block.")
@@ -57,12 +60,12 @@ def preview(
     from illumgrid import store
     from illumgrid.illumination import load
 
-    _check(output, sweep, isovalue, local, split, grid_volume, cut)
+    _check(output, sweep, isovalue, local, trust, split, grid_volume, cut)
     drawn_by, why = pictures.choose_engine(engine)
     light = load(folder)
     if engine == "auto":
         say(f"engine: {drawn_by} ({why})")
-    options: dict[str, Any] = {"view": view, "zoom": zoom, "background": background, "engine": drawn_by}
+    options: dict[str, Any] = {"view": view, "zoom": zoom, "background": background, "engine": drawn_by, "trust": trust}
     if size != (960, 720):
         options |= {"width": size[0], "height": size[1]}
     if sweep is not None:
@@ -70,17 +73,18 @@ def preview(
         return
     assert output is not None
     if grid_volume:
+        del options["trust"]
         picture = pictures.grid_volume(light, field, cut=cut, **options)
     else:
         _told_outside(light, field, isovalue)
         picture = _drawn(light, field, local, split, options)(isovalue)
     store.write_file(output, pictures.png(picture))
-    say(f"wrote {output}" + ("" if local else f" at exposure {light.exposure:.4g}"))
+    say(f"wrote {output}" + ("" if local or trust else f" at exposure {light.exposure:.4g}"))
 
 
 def _check(
-    output: Path | None, sweep: tuple[int, Path] | None, isovalue: float | None, local: bool, split: bool,
-    grid_volume: bool, cut: bool,
+    output: Path | None, sweep: tuple[int, Path] | None, isovalue: float | None, local: bool, trust: bool,
+    split: bool, grid_volume: bool, cut: bool,
 ) -> None:  # fmt: skip
     """Refuse options that do not go together, or are out of range, before anything is read."""
     if (output is None) == (sweep is None):
@@ -90,12 +94,15 @@ def _check(
         raise BadInput(f"--output is {output.name!r}; expected a file name that ends in .png")
     if isovalue is not None and not math.isfinite(isovalue):
         raise BadInput(f"--isovalue is {isovalue}; expected a finite number")
-    alone = {"--sweep": sweep is not None, "--isovalue": isovalue is not None, "--local": local, "--split": split}
+    alone = {"--sweep": sweep is not None, "--isovalue": isovalue is not None, "--local": local, "--trust": trust,
+             "--split": split}  # fmt: skip
     if grid_volume and any(alone.values()):
         raise BadInput(f"{next(o for o in alone if alone[o])} came with --grid-volume, which has no isovalue and one "
                        "light; leave one of the two out")  # fmt: skip
     if cut and not grid_volume:
         raise BadInput("--cut came without --grid-volume; expected both, or neither")
+    if trust and (local or split):
+        raise BadInput(f"--trust came with {'--local' if local else '--split'}; expected one: bars are of global light")
     if local and split:
         raise BadInput("--local and --split came together; expected one: --split shows the local light on its left")
     if sweep is not None:

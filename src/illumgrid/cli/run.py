@@ -161,6 +161,14 @@ def run(
     settings: Annotated[
         list[str] | None, typer.Option("--set", metavar="STAGE.OPTION=VALUE", help="Any option of a stage, repeatable.")
     ] = None,
+    error: Annotated[
+        float | None,
+        typer.Option(metavar="E", help="Choose nodes, paths and bounces for this relative error, such as 0.03."),
+    ] = None,
+    seconds: Annotated[
+        float | None,
+        typer.Option(metavar="S", help="Choose them for this much computing time. Reading and writing come on top."),
+    ] = None,
     smooth: Annotated[
         float | None, typer.Option(min=0.0, metavar="SIGMA", help="Gaussian blur in voxels before anything else.")
     ] = None,
@@ -183,7 +191,7 @@ def run(
         names = {"sampler": sampler, "backend": backend, "interpolator": interpolator}
         stages = _stages(names, settings or [], {"backend.threads": threads, "sampler.count": isovalues})
         given = _input(source, surroundings, limits, inside, albedo)
-        if given.preset:
+        if given.preset and error is None and seconds is None:
             grid, paths = grid or given.preset.grid, paths or given.preset.paths
             isovalues = isovalues or given.preset.isovalues
         folder = output or Path(f"{given.name}-light")
@@ -196,17 +204,58 @@ def run(
                 tell(finding.name, finding.sentence)
         with told_progress() as progress:
             light = light_up(
-                scene, **stages, grid=grid, paths=paths or 64, bounces=bounces, isovalues=isovalues, seed=seed,
-                progress=progress,
+                scene, **stages, grid=grid, paths=paths, bounces=bounces, isovalues=isovalues, seed=seed,
+                error=error, seconds=seconds, progress=progress,
             )  # fmt: skip
+            light = _judged(light, stages["backend"], seed)
+        _told_help(light, stages)
     recipe = {**light.recipe, "input": source or given.name, "smooth": smooth or 0.0, "warnings": sentences}
     replace(light, recipe=recipe).save(folder, preview=not no_preview, overwrite=overwrite)
     _told_result(light, folder, time.perf_counter() - begun, picture=not no_preview)
+
+
+def _judged(light: "Illumination", backend: Any, seed: int) -> "Illumination":
+    """With the error that was reached, where the backend can tell it at points that each have a level set."""
+    from dataclasses import asdict
+
+    from illumgrid import registry
+    from illumgrid.plan import judge
+
+    if light.recipe.get("reached") or backend.geometry == "mesh":
+        return light
+    found = asdict(judge(light.scene, registry.backend("auto"), light.grids, seed))
+    return replace(light, recipe={**light.recipe, "reached": found})
+
+
+def _told_help(light: "Illumination", stages: dict[str, Any]) -> None:
+    """Where more paths would not help much, what would."""
+    from illumgrid.plan import helps
+
+    recipe = light.recipe
+    if (stages["sampler"].name, stages["interpolator"].name) != ("direct", "nearest") or not recipe.get("reached"):
+        return
+    noise = max((e or 0.0 for e in recipe["relative_error"]), default=0.0)
+    if recipe["reached"]["rmse"] < max(0.05, 1.5 * noise):
+        return
+    found = helps(light.scene, stages["backend"], recipe["grid"], recipe["bounces"], recipe["seed"])
+    told = f"between the nodes the light is off by about {found['now']:.1%}, whatever the paths"
+    if found["finer"] < 0.8 * found["now"]:
+        told += f"; --grid {2 * recipe['grid']} would make that {found['finer']:.1%}"
+    if found["smooth"] < 0.8 * found["now"]:
+        told += f"; --smooth 1, which lights a field without its noise, {found['smooth']:.1%}"
+    tell("grid", told)
 
 
 def _told_result(light: "Illumination", folder: Path, seconds: float, picture: bool) -> None:
     recipe = light.recipe
     errors = [e for e in recipe["relative_error"] if e is not None]
     noise = f", noise about {max(errors):.1%} of the mean light" if errors else ""
+    plan, reached = recipe.get("plan"), recipe.get("reached")
+    if plan:
+        for sentence in plan["why"]:
+            say(f"  {sentence}")
     say(f"{recipe['queries']} queries x {recipe['paths']} paths in {seconds:.1f} s{noise}{told_left_out(recipe)}")
+    if reached:
+        asked = f"; the pilot said {plan['error']:.2%}" if plan else ""
+        say(f"error reached: {reached['rmse']:.2%} of the mean light (median {reached['median']:.2%}){asked}")
     say(f"wrote {folder}" + (f"; look at {folder / 'preview.png'}" if picture else ""))

@@ -12,6 +12,7 @@ from illumgrid.preview import gl, meshes, software
 from illumgrid.preview.block import Block
 from illumgrid.preview.camera import VIEWS, Camera, View, camera_around, corners, fit_camera, widest_row
 from illumgrid.preview.shade import BACKGROUND, CAP_TONE, Colors, Shown
+from illumgrid.preview.trust import with_scale
 from illumgrid.tone import decode_srgb, encode_srgb
 
 if TYPE_CHECKING:
@@ -74,6 +75,7 @@ def render(
     width: int = 960,
     height: int = 720,
     local: bool = False,
+    trust: bool = False,
     view: View = None,
     zoom: float = 1.0,
     background: str | None = None,
@@ -93,6 +95,8 @@ def render(
         Pixels.
     local : bool
         Light by a lamp at the camera only, for comparison.
+    trust : bool
+        In place of light its relative error bar, with a scale; holes are hatched.
     view : str or (azimuth, elevation), optional
         A name of `VIEWS`, or degrees to the right of the front and upwards.
     zoom : float
@@ -115,10 +119,11 @@ def render(
     number = 0 if field is None else scene.number_of(field)
     row = scene.levels(0.5)[0] if isovalue is None else scene.levels_through(number, isovalue)[0]
     low, high = scene.fields[number].range
-    shown = Shown(light, row, float(np.clip((row[number] - low) / (high - low), 0.0, 1.0)), local)
+    shown = Shown(light, row, float(np.clip((row[number] - low) / (high - low), 0.0, 1.0)), local, trust)
     if camera is None:
         camera = fit_camera(scene, row, width / height, view, zoom)
-    return encode_srgb(_drawn(shown, camera, sheet, drawn_by))
+    picture = encode_srgb(_drawn(shown, camera, sheet, drawn_by))
+    return with_scale(picture, light) if trust else picture
 
 
 def _drawn(shown: Shown, camera: Camera, sheet: _Sheet, engine: str) -> Colors:

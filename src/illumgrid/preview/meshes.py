@@ -55,7 +55,7 @@ def solid(shown: Shown, number: int, field: Field, eye: Floats) -> list[Colored]
         for plane in (0, last):
             cut |= (index[:, axis] == plane)[mesh.faces].all(axis=1)
     facing = np.zeros(len(points))
-    if shown.local:
+    if shown.local or shown.trust:
         toward = eye - points
         toward /= np.linalg.norm(toward, axis=1, keepdims=True)
         normals = outward_normals(field.volume, index, field.inside) @ field.volume.direction.T

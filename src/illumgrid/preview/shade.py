@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from illumgrid.preview.trust import trust_colors
 from illumgrid.scene import Scene
 from illumgrid.tone import WHITE
 from illumgrid.volume import Floats
@@ -33,12 +34,15 @@ class Shown:
         The place in the common sweep, 0 to 1, as the walls know it.
     local : bool
         Light by a lamp at the camera only.
+    trust : bool
+        In place of light, how sure it is: see `illumgrid.preview.trust`.
     """
 
     light: "Illumination"
     row: Floats
     share: float
     local: bool
+    trust: bool = False
 
     @cached_property
     def scene(self) -> Scene:
@@ -47,6 +51,8 @@ class Shown:
 
     def field(self, number: int, points: Floats, facing: Floats) -> Colors:
         """Colours (n, 3) of the level set of a field at world points (n, 3) that face the eye by this cosine (n,)."""
+        if self.trust:
+            return trust_colors(self.light.grids[number], points, facing)
         albedo = self.scene.fields[number].material.albedo
         if self.local:
             return np.float32(WHITE) * _headlit(albedo / albedo.max(initial=1e-9), facing)
@@ -59,7 +65,7 @@ class Shown:
     def wall(self, number: int, u: Floats, v: Floats, facing: Floats) -> Colors:
         """Colours (n, 3) of the front of a quad at shares u, v (n,) of its edges."""
         material = self.scene.quads[number].material
-        if self.local:
+        if self.local or self.trust:
             return np.float32(WHITE) * _headlit(np.maximum(material.albedo, material.emission.clip(0, 1)), facing)
         shown = material.albedo / np.pi * self.light.walls[number].lookup(u, v, self.share) + material.emission
         return (shown * self.light.exposure).astype(np.float32)

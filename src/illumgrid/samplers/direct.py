@@ -14,7 +14,7 @@ from illumgrid.grid import GridSpec
 from illumgrid.samples import Queries
 from illumgrid.scene import Field, Scene
 from illumgrid.stages import Sampler, hookimpl
-from illumgrid.volume import interpolate, world_to_index
+from illumgrid.volume import index_to_world, interpolate, project, world_to_index
 
 _BATCH = 1 << 14
 
@@ -27,13 +27,18 @@ def _any_corner(voxels: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return voxels
 
 
+def crossed_cells(field: Field) -> NDArray[np.bool_]:
+    """Voxel cells (nx - 1, ny - 1, nz - 1) through which some level set of the field's range passes."""
+    values = field.volume.values
+    return _any_corner(values >= field.range[0]) & _any_corner(values <= field.range[1])
+
+
 def reachable(field: Field, spec: GridSpec) -> NDArray[np.int64]:
     """Flat numbers of the nodes that a lookup on some isosurface of the field's range can touch.
 
     They are the corners of all grid cells that overlap a voxel cell which some level set within the range crosses.
     """
-    values = field.volume.values
-    crossed = _any_corner(values >= field.range[0]) & _any_corner(values <= field.range[1])
+    crossed = crossed_cells(field)
     for axis in range(3):
         line = np.moveaxis(crossed, axis, 0)
         voxel_cells, grid_cells = len(line), spec.shape[axis] - 1
@@ -45,6 +50,27 @@ def reachable(field: Field, spec: GridSpec) -> NDArray[np.int64]:
     for corner in np.ndindex(2, 2, 2):
         nodes[tuple(slice(c, c + n) for c, n in zip(corner, crossed.shape))] |= crossed
     return np.flatnonzero(nodes)
+
+
+def at_nodes(scene: Scene, field: int, spec: GridSpec, nodes: NDArray[np.integer]) -> Queries:
+    """What `Direct` asks at the nodes with these flat numbers; each has its number as id."""
+    own, points = scene.fields[field], spec.nodes(nodes)
+    index = world_to_index(own.volume, points)
+    isovalues = interpolate(own.volume, index)
+    # A rim node stands for the end of the range: light of a level that no sweep reaches would be wrong there (at the
+    # value of an empty background everything is solid, and dark). A projection goes no farther than a voxel; a node of
+    # a coarser grid goes there over isovalues in between.
+    level = np.clip(isovalues, *own.range)
+    rim = np.flatnonzero(level != isovalues)
+    steps = int(np.ceil((spec.spacing / own.volume.spacing).max() - 1e-9))
+    for step in range(1, steps):
+        between = isovalues[rim] + (level - isovalues)[rim] * step / steps
+        moved, arrived = project(own.volume, index[rim], between)
+        index[rim[arrived]] = moved[arrived]
+    points[rim] = index_to_world(own.volume, index[rim]) if steps > 1 else points[rim]
+    asked = Queries.at(scene, points, field=field, level=level)
+    ids = nodes.astype(np.uint64) | np.uint64(field << 40)
+    return Queries(ids, asked.point, asked.normal, asked.level, asked.target)
 
 
 @dataclass(frozen=True)
@@ -62,19 +88,7 @@ class Direct:
         for number, (field, spec) in enumerate(zip(scene.fields, specs)):
             nodes = reachable(field, spec)
             for first in range(0, len(nodes), _BATCH):
-                batch = nodes[first : first + _BATCH]
-                points = spec.nodes(batch)
-                own = interpolate(field.volume, world_to_index(field.volume, points))
-                # A rim node stands for the end of the range: light of a level that no sweep reaches would be wrong
-                # there (at the value of an empty background everything is solid, and dark).
-                asked = Queries.at(scene, points, field=number, level=np.clip(own, *field.range))
-                yield Queries(
-                    batch.astype(np.uint64) | np.uint64(number << 40),
-                    asked.point,
-                    asked.normal,
-                    asked.level,
-                    asked.target,
-                )
+                yield at_nodes(scene, number, spec, nodes[first : first + _BATCH])
 
 
 @hookimpl

@@ -1,0 +1,238 @@
+"""Speed and accuracy in figures: ``python benchmarks/chart.py [PART...] [--volumes DIR] [--json FILE] [--quick]``.
+
+promises
+    `--error` and `--seconds` on five fields of 48³ voxels, against a truth on level sets: is what was asked kept?
+ways
+    `direct` with `nearest` against every other sampler and interpolator, each at its best setting, at equal error.
+goals
+    A smooth field of 96³ (forty Gaussians) and the MRI `stroke_T1`, raw and smoothed by a voxel, within a time.
+pays
+    After how many isovalues has the grid paid for itself against path tracing each isosurface anew at equal error?
+volumes
+    `bench` on real volumes (charts as PNG beside the JSON file), and where `run`'s defaults lie against the front.
+
+All with a white sky, albedo 0.8, 6 bounces unless chosen by the pilot, and the backend numba. Real volumes are looked
+for in DIR, by default ../shared/volumes from the repository's root, and passed over where they are not.
+"""
+
+import argparse
+import json
+import os
+import time
+import warnings
+from pathlib import Path
+
+import numpy as np
+from rays import gaussians
+
+from illumgrid import Queries, Scene, Volume, backend, isosurface, read_volume, run
+from illumgrid.bench import bench, report, sizes
+from illumgrid.bench.contestants import ways as every_way
+from illumgrid.bench.race import Race, front
+from illumgrid.plan import planned
+from illumgrid.scene import level_table
+from illumgrid.truth import Truth, begin, converge, errors, look_up, unseen_on_level_sets
+from illumgrid.volume import smooth
+
+ROOT = Path(__file__).resolve().parents[1]
+BOUNCES = 6
+RANGES = {
+    "nucleon.nrrd": (40, 200), "fuel.nrrd": (15, 200), "neghip.nrrd": (30, 180), "hydrogen_atom.nrrd": (12, 80),
+    "stroke_T1.nii.gz": (60, 110), "vis_male.nrrd": (40, 70), "aquarius-A2.nrrd": (60, 150),
+    "betaGal.mrc.gz": (0.05, 0.13), "Bi2O3_ch0.nrrd": (0.05, 0.4), "benzene-homo.nrrd": (0.01, 0.08),
+}  # fmt: skip
+
+
+def labyrinth(voxels=48):
+    x, y, z = np.meshgrid(*[4.5 * np.linspace(-1, 1, voxels)] * 3, indexing="ij")
+    return Volume(np.sin(x) * np.cos(y) + np.sin(y) * np.cos(z) + np.sin(z) * np.cos(x))
+
+
+def noisy(voxels=48):
+    field = gaussians(voxels).values
+    return Volume(field + np.random.default_rng(0).normal(scale=0.03, size=field.shape))
+
+
+def fields():
+    return {
+        "forty Gaussians": Scene.sky(gaussians(48), range=(0.2, 1.2)),
+        "the same, noisy": Scene.sky(noisy(), range=(0.3, 1.0)),
+        "labyrinth": Scene.sky(labyrinth(), range=(-0.4, 0.4)),
+        "hollows": Scene.sky(gaussians(48, seed=5), range=(0.4, 1.2), inside="below"),
+        "on a floor": Scene.floor(gaussians(48, count=15, seed=9), range=(0.2, 0.8)),
+    }
+
+
+def truth_of(scene, error=0.002, levels=40, points=8000, bounces=32, paths=4096):
+    asked = unseen_on_level_sets(scene, levels, points, 77)
+    return converge(begin(scene, backend("numba"), asked, bounces, 77), scene, backend("numba"), 77, error, paths)
+
+
+def off(light, truth):
+    return errors(look_up(light.grids, truth.samples.queries), truth)
+
+
+def timed(scene, **options):
+    begun = time.perf_counter()
+    light = run(scene, **options)
+    return light, time.perf_counter() - begun
+
+
+def promises(asked):
+    """Ratios of what came to what was asked."""
+    found = []
+    for name, scene in fields().items():
+        truth = truth_of(scene, 0.003)
+        for option, values in (("error", (0.05, 0.02, 0.01)), ("seconds", (5, 15) if asked.quick else (5, 20, 60))):
+            for value in values:
+                light, seconds = timed(scene, **{option: value}, isovalues=4, seed=3)
+                reached, plan = off(light, truth).rmse, light.recipe["plan"]
+                ratio = reached / value if option == "error" else seconds / value
+                found.append(
+                    {"field": name, option: value, "ratio": ratio, "rmse": reached, "took": seconds, "plan": plan,
+                     "judged": light.recipe["reached"]["rmse"]}
+                )  # fmt: skip
+                chosen = f"grid {plan['grid']}, {plan['paths']} paths, met {plan['met']}"
+                came = f"{reached:7.2%} in {seconds:6.1f} s, ratio {ratio:5.2f}"
+                print(f"  {name:18} {option} {value:<5} {came}, {chosen}")
+    error = [f["ratio"] for f in found if "error" in f and f["plan"]["met"]]
+    seconds = [f["ratio"] for f in found if "seconds" in f and f["plan"]["met"]]
+    print(f"  errors within 1.3: {np.mean(np.array(error) <= 1.3):.0%} of {len(error)}; "
+          f"times within 20 %: {np.mean(np.abs(np.array(seconds) - 1) <= 0.2):.0%} of {len(seconds)}")  # fmt: skip
+    return found
+
+
+def race_of(scene, budget):
+    """All points of a race with a fixed number of bounces, and its truth."""
+    truth = truth_of(scene, 0.004, levels=24, points=2400, bounces=BOUNCES)
+    entrants, _ = every_way(scene, truth.samples.queries, budget)
+    entrants = [way for way in entrants if way.backend.name == "numba" and way.surface == "levelset"]
+    race = Race(scene, {"levelset": Truth(truth.samples, BOUNCES)}, entrants, sizes(scene), BOUNCES, 0)
+    begun = time.perf_counter()
+    while lane := race.next(budget - (time.perf_counter() - begun)):
+        race.step(lane)
+    return race
+
+
+def ways(asked):
+    """At equal error: seconds of the paper's way, at its best, over those of direct."""
+    cases = {"forty Gaussians": fields()["forty Gaussians"], "labyrinth": fields()["labyrinth"]}
+    if (place := asked.volumes / "stroke_T1.nii.gz").exists():
+        cases["stroke_T1, smoothed"] = Scene.sky(smooth(read_volume(place), 1.0), range=(60, 110))
+    found = {}
+    for name, scene in cases.items():
+        race = race_of(scene, 60 if asked.quick else 400)
+        exact = race.truths["levelset"]
+        own = front([p for p in race.points if p.label == "direct, numba, nearest"], race.truths)
+        times, rmse = np.log([p.time for p in own]), np.log([p.rmse(exact) for p in own])
+        for label in sorted({p.label.split(",")[0].split()[0] + ", " + p.interpolator.name for p in race.points}):
+            sampler, filler = label.split(", ")
+            theirs = [p for p in race.points if p.way.sampler.name == sampler and p.interpolator.name == filler]
+            best = front(theirs, race.truths)
+            # What direct takes for the error of each of their points, read off its own front.
+            ratios = [
+                float(p.time / np.exp(np.interp(-np.log(p.rmse(exact)), -rmse, times)))
+                for p in best
+                if np.exp(rmse.min()) <= p.rmse(exact) <= np.exp(rmse.max())
+            ]
+            found.setdefault(name, {})[label] = {"ratios": ratios, "best": [(p.time, p.rmse(exact)) for p in best]}
+            said = ", ".join(f"{ratio:.1f}" for ratio in ratios) or "never as good, or as quick"
+            least = f"least error {best[-1].rmse(exact):7.2%} in {best[-1].time:6.1f} s"
+            print(f"  {name:20} {label:18} {least}; times direct: {said}")
+    return found
+
+
+def goals(asked):
+    """The light of two fields within a time."""
+    cases = {"forty Gaussians, 96": (Scene.sky(gaussians(96), range=(0.2, 1.2)), 20, (96, 64))}
+    if (place := asked.volumes / "stroke_T1.nii.gz").exists():
+        raw = read_volume(place)
+        cases["stroke_T1, raw"] = Scene.sky(raw, range=(60, 110)), 120, (320, 160)
+        cases["stroke_T1, --smooth 1"] = Scene.sky(smooth(raw, 1.0), range=(60, 110)), 120, (240, 160)
+    found = {}
+    for name, (scene, seconds, grids) in cases.items():
+        truth = truth_of(scene, 0.002 if "Gaussians" in name else 0.01, bounces=BOUNCES)
+        tries = [{"seconds": 0.9 * seconds, "bounces": BOUNCES}]
+        tries += [{"seconds": 0.9 * seconds, "bounces": BOUNCES, "grid": grid} for grid in grids]
+        for options in tries:
+            light, took = timed(scene, **options, isovalues=4)
+            e = off(light, truth)
+            entry = {"options": options, "took": took, **vars(e), "grid": light.recipe["grid"]}
+            found.setdefault(name, []).append(entry)
+            print(f"  {name:24} grid {light.recipe['grid']:4}, {light.recipe['paths']:4} paths: {took:6.1f} s, "
+                  f"error {e.rmse:.2%}, median {e.median:.2%}")  # fmt: skip
+    return found
+
+
+def pays(asked):
+    """Isovalues after which the grid is cheaper than path tracing every isosurface anew, at the same error."""
+    cases = {"forty Gaussians": fields()["forty Gaussians"]}
+    if (place := asked.volumes / "stroke_T1.nii.gz").exists():
+        cases["stroke_T1, smoothed"] = Scene.sky(smooth(read_volume(place), 1.0), range=(60, 110))
+    found = {}
+    for name, scene in cases.items():
+        plan = planned(scene, backend("numba"), level_table(scene, 4), error=0.03, bounces=BOUNCES)
+        light, whole = timed(scene, grid=plan.grid, paths=plan.paths, bounces=BOUNCES, isovalues=4)
+        each, lookup = [], []
+        for t in (0.2, 0.5, 0.8):
+            level = float(scene.levels(t)[0, 0])
+            vertices = isosurface(scene.fields[0].volume, level).vertices  # which both ways need
+            begun = time.perf_counter()
+            few = backend("numba").solve(
+                scene, Queries.at(scene, vertices, level=level), paths=range(16), bounces=BOUNCES, seed=0
+            )
+            tracing = time.perf_counter() - begun
+            noise = np.sqrt((few.stderr[few.paths > 0].astype(float) ** 2).mean()) / few.mean.mean()
+            each.append(tracing * max(1.0, 16 * (noise / 0.03) ** 2) / 16)  # paths that make the noise equal
+            begun = time.perf_counter()
+            light.grids[0].lookup(vertices)
+            lookup.append(time.perf_counter() - begun)
+        after = whole / max(1e-9, np.mean(each) - np.mean(lookup))
+        found[name] = {"grid_seconds": whole, "each_seconds": each, "lookup_seconds": lookup, "isovalues": after}
+        print(f"  {name:20} grid {whole:.1f} s, each isosurface {np.mean(each):.2f} s, lookup {np.mean(lookup):.3f} s: "
+              f"paid for after {after:.0f} isovalues")  # fmt: skip
+    return found
+
+
+def volumes(asked):
+    """Charts of real volumes, and the error and time of run's defaults beside the front."""
+    found = {}
+    for name, limits in RANGES.items():
+        if not (asked.volumes / name).exists():
+            continue
+        scene = Scene.sky(read_volume(asked.volumes / name), range=limits)
+        result = bench(scene, 40 if asked.quick else 150)
+        content, said = report.files(result, name.split(".")[0], scene)
+        (asked.json.parent / f"chart-{name.split('.')[0]}.png").write_bytes(content["chart.png"])
+        light, took = timed(scene)
+        exact = result.truths["levelset"]
+        rmse = off(light, exact).rmse
+        beaten = [p for p in result.front if p.time < took and p.rmse(exact) < rmse]
+        advice = said.splitlines()[-1]
+        found[name] = {"default": {"seconds": took, "rmse": rmse, "beaten": len(beaten)}, "advice": advice}
+        better = [f"{p.label} {p.grid} x {p.paths} ({p.time:.1f} s, {p.rmse(exact):.2%})" for p in beaten]
+        print(f"  {name:20} default {took:6.1f} s {rmse:7.2%}; beaten by {', '.join(better) or 'nobody'}")
+        print(f"    {advice}")
+    return found
+
+
+PARTS = {part.__name__: part for part in (promises, ways, goals, pays, volumes)}
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("parts", nargs="*", choices=[*PARTS, []], help="by default all")
+    parser.add_argument("--volumes", type=Path, default=ROOT.parent / "shared" / "volumes")
+    parser.add_argument("--json", type=Path, default=ROOT / "benchmarks" / "chart.json")
+    parser.add_argument("--quick", action="store_true", help="smaller budgets")
+    asked = parser.parse_args()
+    warnings.simplefilter("ignore")
+    figures = json.loads(asked.json.read_text()) if asked.json.exists() else {}
+    for part in asked.parts or PARTS:
+        print(f"{part} ({os.cpu_count()} cores, load {os.getloadavg()[0]:.1f})")
+        figures[part] = PARTS[part](asked)
+        asked.json.write_text(json.dumps(figures, indent=1, default=float) + "\n")
+
+
+if __name__ == "__main__":
+    main()

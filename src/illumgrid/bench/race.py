@@ -1,0 +1,278 @@
+"""The race: who is how far off after how many seconds, cheapest and most promising first, within a budget."""
+
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from illumgrid.bench.contestants import COUNTS, Way
+from illumgrid.bench.picture import Studio
+from illumgrid.errors import BadInput
+from illumgrid.grid import GridSpec, IlluminationGrid, read_lattice
+from illumgrid.samples import Queries, Samples, combine, join_samples
+from illumgrid.scene import Scene
+from illumgrid.stages import Interpolator
+from illumgrid.truth import Truth, errors, look_up
+from illumgrid.volume import Floats
+
+PATHS = (4, 16, 64, 256, 1024)
+SEEDS = 3
+
+
+@dataclass(eq=False)
+class Point:
+    """One contestant at one setting: a point of the chart, of as many runs as there are seeds.
+
+    Parameters
+    ----------
+    way : Way
+    interpolator : Interpolator
+    grid, paths, queries : int
+    seconds : list of float
+        One a seed: sampler, backend and interpolator.
+    light : list of (n, 3) float64
+        One a seed: what the grids hold at the points of the truth.
+    covered : (n,) bool
+        Points that read only nodes with light of their own.
+    memory : float, optional
+        Megabytes by which the process grew at most, in one run; known on Linux.
+    flip : float, optional
+        Of a picture at an unseen isovalue.
+    """
+
+    way: Way
+    interpolator: Interpolator
+    grid: int
+    paths: int
+    queries: int
+    covered: NDArray[np.bool_]
+    seconds: list[float] = field(default_factory=list)
+    light: list[Floats] = field(default_factory=list)
+    memory: float | None = None
+    flip: float | None = None
+
+    @property
+    def label(self) -> str:
+        """Name of the contestant."""
+        return self.way.label(self.interpolator)
+
+    @property
+    def time(self) -> float:
+        """Median seconds over the seeds."""
+        return float(np.median(self.seconds))
+
+    def rmse(self, truth: Truth) -> float:
+        """Relative root mean square error, the mean over the seeds."""
+        return float(np.mean([errors(light, truth).rmse for light in self.light]))
+
+
+@dataclass(eq=False)
+class Run:
+    """A way on a grid with one seed, that goes on with more paths: earlier ones are kept."""
+
+    scene: Scene
+    way: Way
+    grid: int
+    bounces: int
+    seed: int
+    batches: list[Queries] = field(default_factory=list)
+    answers: list[Samples] = field(default_factory=list)
+    paths: int = 0
+    asking: float = 0.0
+    tracing: float = 0.0
+
+    @property
+    def specs(self) -> list[GridSpec]:
+        """Lattices, one a field."""
+        return [GridSpec.over(f.volume, self.grid) for f in self.scene.fields]
+
+    def go_on(self, paths: int) -> None:
+        """Trace until each query has so many paths."""
+        begun = time.perf_counter()
+        if not self.batches:
+            self.batches = [q for q in self.way.sampler.queries(self.scene, self.specs, self.seed) if len(q)]
+            self.asking = time.perf_counter() - begun
+            begun = time.perf_counter()
+        more = range(self.paths, paths)
+        new = [
+            self.way.backend.solve(self.scene, batch, paths=more, bounces=self.bounces, seed=self.seed)
+            for batch in self.batches
+        ]
+        self.answers = [combine(a, b) for a, b in zip(self.answers, new)] if self.answers else new
+        self.paths = paths
+        self.tracing += time.perf_counter() - begun
+
+    def fill(self, interpolator: Interpolator) -> tuple[list[IlluminationGrid], float]:
+        """Grids from the samples so far, and the seconds that this took, all in all."""
+        begun = time.perf_counter()
+        grids = []
+        for number, spec in enumerate(self.specs):
+            own = [a for a in self.answers if len(a) and a.queries.target[0] == number]
+            grids.append(interpolator.fill(join_samples(own), spec, number))
+        return grids, self.asking + self.tracing + time.perf_counter() - begun
+
+
+def covered(grids: list[IlluminationGrid], asked: Queries) -> NDArray[np.bool_]:
+    """Points that read only nodes with light of their own."""
+    result = np.zeros(len(asked), bool)
+    for number, grid in enumerate(grids):
+        own = asked.target == number
+        lit = (grid.support > 0).astype(np.float32)[..., None]
+        result[own] = read_lattice(grid.spec, lit, asked.point[own])[:, 0] > 1 - 1e-5
+    return result
+
+
+def front(points: Iterable[Point], truths: dict[str, Truth]) -> list[Point]:
+    """Points that nobody beats in both time and error, from fast to accurate."""
+    best, found = np.inf, []
+    for point in sorted(points, key=lambda p: p.time):
+        if (rmse := point.rmse(truths[point.way.surface])) < best:
+            best = rmse
+            found.append(point)
+    return found
+
+
+@dataclass(eq=False)
+class Lane:
+    """A way on one grid: what it has shown so far, and what its next step would cost."""
+
+    run: Run
+    interpolators: tuple[Interpolator, ...]
+    rung: int = 0
+    cost: float = 0.0
+    lag: float = 1.0
+    stuck: bool = False
+
+
+class Race:
+    """Lanes of ways on grids, stepped one at a time.
+
+    Parameters
+    ----------
+    scene : Scene
+    truths : dict of Truth
+        By surface.
+    ways : sequence of Way
+    sizes : sequence of int
+        Grids, from coarse to fine.
+    bounces, seed : int
+    """
+
+    def __init__(
+        self, scene: Scene, truths: dict[str, Truth], ways: list[Way], sizes: list[int], bounces: int, seed: int
+    ) -> None:
+        self.scene, self.truths, self.sizes, self.bounces, self.seed = scene, truths, sizes, bounces, seed
+        self.lanes = [Lane(Run(scene, way, sizes[0], bounces, seed), way.interpolators) for way in ways]
+        self.points: list[Point] = []
+        self.notes: list[str] = []
+
+    def step(self, lane: Lane) -> None:
+        """Take the next rung of a lane, and fill the grid by every interpolator."""
+        run, paths = lane.run, PATHS[lane.rung]
+        begun = time.perf_counter()
+        try:
+            run.go_on(paths)
+            new = [self._point(run, interpolator)[0] for interpolator in lane.interpolators]
+        except BadInput as reason:
+            self.notes.append(f"{run.way.label(run.way.interpolators[0])}, {run.grid} nodes: {reason}")
+            self.lanes.remove(lane)
+            return
+        spent = time.perf_counter() - begun
+        truth = self.truths[run.way.surface]
+        before = [p for p in self.points if p.way is run.way and p.grid == run.grid and p.paths == PATHS[lane.rung - 1]]
+        self.points += new
+        now = [p.rmse(truth) for p in new]
+        # A way off the front by a factor waits by its square: what noise would take to make that up.
+        lead = {id(p): self._lead(p) for p in new}
+        lags = [max(1.0, r / lead[id(p)]) for r, p in zip(now, new)]
+        lane.lag = min(lags)
+        if len(new) > 1:  # a slow filler that is also far off holds the others up
+            slow = [p.seconds[0] - run.asking - run.tracing > 0.5 * (run.asking + run.tracing) for p in new]
+            keep = [not (s and lag > max(2.0, 1.5 * lane.lag)) for s, lag in zip(slow, lags)]
+            lane.interpolators = tuple(p.interpolator for p, k in zip(new, keep) if k)
+        lane.stuck = bool(before) and min(now) > 0.9 * min(p.rmse(truth) for p in before)
+        lane.rung += 1
+        lane.cost = spent * (PATHS[lane.rung] / paths - 1) if lane.rung < len(PATHS) else np.inf
+        if lane.rung == 1:
+            self._unlock(lane, spent)
+
+    def _unlock(self, lane: Lane, spent: float) -> None:
+        """What comes after the first rung of a lane: the next finer grid, and on the coarsest more level sets."""
+        run = lane.run
+        if finer := [size for size in self.sizes if size > run.grid]:
+            ahead = Run(self.scene, run.way, finer[0], self.bounces, self.seed)
+            self.lanes.append(Lane(ahead, lane.interpolators, 0, spent * (finer[0] / run.grid) ** 3, lane.lag))
+        if run.way.denser and run.grid == self.sizes[0]:
+            ahead = Run(self.scene, run.way.denser, run.grid, self.bounces, self.seed)
+            more = COUNTS[1] / COUNTS[0]
+            self.lanes.append(Lane(ahead, lane.interpolators, 0, spent * more, lane.lag))
+
+    def _point(self, run: Run, interpolator: Interpolator) -> tuple[Point, list[IlluminationGrid]]:
+        grids, seconds = run.fill(interpolator)
+        asked = self.truths[run.way.surface].samples.queries
+        queries = sum(len(a) for a in run.answers)
+        point = Point(run.way, interpolator, run.grid, run.paths, queries, covered(grids, asked))
+        point.seconds.append(seconds)
+        point.light.append(look_up(grids, asked))
+        return point, grids
+
+    def _lead(self, point: Point) -> float:
+        """Least error of anybody who took no longer."""
+        truth = self.truths
+        return max(1e-9, min(p.rmse(truth[p.way.surface]) for p in self.points if p.time <= 1.05 * point.time))
+
+    def next(self, left: float) -> Lane | None:
+        """The lane to step: least predicted time, those who lag counted as slower; None if the rest is too costly.
+
+        What the seeds will cost that the front still lacks is kept back.
+        """
+        kept = 1.1 * (SEEDS - 1) * sum(self.front_ladders().values())
+        able = [lane for lane in self.lanes if not lane.stuck and lane.rung < len(PATHS)]
+        able = [lane for lane in able if kept + (2 * SEEDS - 1) * lane.cost < left or lane.cost == 0.0]
+        return min(able, key=lambda lane: (lane.cost * lane.lag**2, lane.run.grid), default=None)
+
+    def front_ladders(self) -> dict[tuple[int, int, int], float]:
+        """Way, grid and most paths of the front's points that lack seeds, with the seconds of the longest of each."""
+        found: dict[tuple[int, int], Point] = {}
+        for point in front(self.points, self.truths):
+            key = id(point.way), point.grid
+            if len(point.seconds) < SEEDS and (key not in found or found[key].paths < point.paths):
+                found[key] = point
+        return {(*key, point.paths): point.time for key, point in found.items()}
+
+    def repeat(self, deadline: float, tell: Callable[[], None], studio: Studio | None = None) -> None:
+        """Run what the front consists of with other seeds, until every point on it has enough of them."""
+        while ladders := self.front_ladders():
+            way, grid, most = min(ladders, key=lambda key: ladders[key])
+            if time.perf_counter() + ladders[way, grid, most] > deadline:
+                return
+            same = [p for p in self.points if id(p.way) == way and p.grid == grid and p.paths <= most]
+            fillers = {p.interpolator for p in front(self.points, self.truths)}
+            same = [p for p in same if p.interpolator in fillers]
+            seed = self.seed + max(len(p.seconds) for p in same if p.paths == most)
+            run, before = Run(self.scene, same[0].way, grid, self.bounces, seed), resident(reset=True)
+            for paths in sorted({p.paths for p in same}):
+                run.go_on(paths)
+                for point in same:
+                    if point.paths == paths and len(point.seconds) == seed - self.seed:
+                        again, grids = self._point(run, point.interpolator)
+                        point.seconds += again.seconds
+                        point.light += again.light
+                        point.memory = (resident() or 0.0) - before if before else None
+                        if studio and point.flip is None:
+                            point.flip = studio.flip(grids)
+            tell()
+
+
+def resident(reset: bool = False) -> float | None:
+    """Megabytes that the process held at most since the last reset; None where the system does not tell."""
+    try:
+        if reset:
+            Path("/proc/self/clear_refs").write_text("5")
+        lines = Path("/proc/self/status").read_text().splitlines()
+        return next(int(line.split()[1]) / 1024 for line in lines if line.startswith("VmHWM"))
+    except (OSError, StopIteration):
+        return None

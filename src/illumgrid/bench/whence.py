@@ -1,0 +1,40 @@
+"""Where the error comes from, over grids and paths: what to buy next."""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from illumgrid.pilot import Pilot
+from illumgrid.scene import Scene
+from illumgrid.split import Split
+from illumgrid.stages import Backend
+
+PATHS = (16, 64, 256)
+
+
+@dataclass(frozen=True)
+class Bar:
+    """The parts of the error of `Direct` with `Nearest` on one grid with so many paths."""
+
+    grid: int
+    paths: int
+    split: Split
+
+
+def bars(
+    scene: Scene, backend: Backend, sizes: Sequence[int], bounces: int, seed: int, seconds: float, points: int = 512
+) -> list[Bar]:
+    """Measure the parts on grids of these sizes, cheapest first, as far as the time goes."""
+    begun = time.perf_counter()
+    pilot = Pilot.start(scene, backend, points, 0.004, seed + 1)
+    fewer = pilot.fewer(bounces)
+    found: list[Bar] = []
+    last = 0.0
+    for paths in PATHS:
+        for size in sizes:
+            now = time.perf_counter()
+            if now - begun + last > seconds and found:
+                break
+            found.append(Bar(size, paths, pilot.measure(size, fewer, bounces, paths).split))
+            last = (time.perf_counter() - now) * (4 if size == sizes[-1] else 1.5)
+    return sorted(found, key=lambda bar: (bar.grid, bar.paths))

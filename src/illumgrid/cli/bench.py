@@ -1,0 +1,48 @@
+"""``illumgrid bench``: the speed-accuracy chart on the user's own data."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from illumgrid.cli.told import heard, say, told_progress
+
+
+def bench(
+    source: Annotated[
+        str | None,
+        typer.Argument(metavar="[INPUT]", help="What run takes: a volume, scene file or built-in scene."),
+    ] = None,
+    limits: Annotated[
+        tuple[float, float] | None,
+        typer.Option("--range", metavar="LO HI", help="Isovalues to sweep. [default: from the data, as info suggests]"),
+    ] = None,
+    budget: Annotated[float, typer.Option(metavar="S", help="Seconds, from compiled kernels on.")] = 100.0,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", metavar="DIR", help="Where the chart goes. [default: INPUT-bench]")
+    ] = None,
+    smooth: Annotated[
+        float | None, typer.Option(min=0.0, metavar="SIGMA", help="Gaussian blur in voxels before anything else.")
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, max=2**64 - 1, metavar="N", help="Of the contestants and the truth.")] = 0,
+) -> None:
+    """Chart seconds against error for everything that is registered, and say which setting to use.
+
+    DIR then holds bench.json, bench.csv, chart.png and chart.svg.
+    """
+    from illumgrid import bench as benches
+    from illumgrid import store
+    from illumgrid.bench import report
+    from illumgrid.cli.run import _input
+
+    given = _input(source, None, limits, None, None)
+    folder = output or Path(f"{given.name}-bench")
+    store.claim_new(folder)
+    with heard():
+        scene = given.make(smooth or 0.0)
+        with told_progress() as progress:
+            found = benches.bench(scene, budget, seed, progress)
+        files, told = report.files(found, given.name, scene)
+    store.write_folder(folder, iter(files.items()))
+    typer.echo(told)
+    say(f"wrote {folder}; look at {folder / 'chart.png'}")

@@ -1,0 +1,198 @@
+"""No more than a scene needs: nodes, paths and bounces for an asked error or time, from a short pilot."""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from illumgrid.bake import wall_queries
+from illumgrid.grid import IlluminationGrid
+from illumgrid.pilot import FEWEST, MOST, Measured, Pace, Pilot, specs_of, timed
+from illumgrid.scene import Levels, Scene
+from illumgrid.stages import Backend
+from illumgrid.truth import Errors, begin, converge, enough, errors, look_up, unseen_in_volume
+from illumgrid.volume import smooth
+
+SHARE = 0.25  # of the asked error that the bounces left out may be
+JUDGED = 0.95  # of the asked seconds: the rest is for the judgement at the end
+PATHS = 16  # from each node, with which grids are tried
+MOST_NODES = 40_000_000  # a grid of about 2 GB with all that belongs to it
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What the pilot chose, and why.
+
+    Parameters
+    ----------
+    grid, paths, bounces : int
+    error : float
+        Predicted relative error.
+    seconds : float
+        Predicted time of the run.
+    pilot : float
+        Seconds that the pilot took.
+    met : bool
+        Whether the asked error, or time, is predicted to be kept.
+    why : tuple of str
+        Sentences for the user.
+    """
+
+    grid: int
+    paths: int
+    bounces: int
+    error: float
+    seconds: float
+    pilot: float
+    met: bool
+    why: tuple[str, ...]
+
+
+def sizes(scene: Scene) -> list[int]:
+    """Grid sizes worth trying, in steps of about √2, up to two nodes for each voxel's side."""
+    longest = max(max(field.volume.shape) for field in scene.fields)
+    return [max(4, round(longest * 2.0 ** (k / 2))) for k in range(-8, 3) if longest * 2.0 ** (k / 2) > 5]
+
+
+@dataclass(frozen=True)
+class Choice:
+    """A size and a number of paths, with the predicted relative error and seconds of the run."""
+
+    measured: Measured
+    paths: int
+    error: float
+    seconds: float
+    met: bool
+
+
+def choose(
+    tried: Sequence[Measured], pace: Pace, walls: int, error: float | None, seconds: float, paths: int | None
+) -> Choice:
+    """The least time for an error, or else the least error for a time; if neither can be had, what comes nearest."""
+
+    def choice(m: Measured, count: int, met: bool) -> Choice:
+        return Choice(m, count, float(np.sqrt(m.squared(count))), pace.seconds(m.nodes + walls, count), met)
+
+    if error is not None:
+        kept = []
+        for m in tried:
+            count = paths or m.paths_for(error**2)
+            if count and m.squared(count) <= 1.001 * error**2:
+                kept.append(choice(m, count, True))
+        if kept:
+            return min(kept, key=lambda c: c.seconds)
+        best = min(tried, key=lambda m: m.floor)
+        return choice(best, paths or best.paths_for(1.25 * best.floor) or 64, False)
+    counts = [paths or min(MOST, pace.paths_in(seconds, m.nodes + walls)) for m in tried]
+    kept = [choice(m, n, True) for m, n in zip(tried, counts) if n >= FEWEST]
+    if kept:
+        return min(kept, key=lambda c: c.error)
+    return choice(min(tried, key=lambda m: m.nodes), paths or FEWEST, False)
+
+
+def _ladder(
+    pilot: Pilot, candidates: Sequence[int], bounces: int, pace: Pace, error: float | None, seconds: float
+) -> list[Measured]:
+    """Measure grids from coarse to fine until finer ones cannot be the choice."""
+    fewer, found = pilot.fewer(bounces), []
+    for grid in candidates:
+        found.append(now := pilot.measure(grid, fewer, bounces, PATHS))
+        if pace.seconds(now.nodes, FEWEST) > seconds or now.nodes > MOST_NODES:
+            break
+        if error is not None and now.floor < 0.1 * error**2:
+            break
+    return found
+
+
+def reasons(scene: Scene, choice: Choice, bounces: int, left_out: float) -> tuple[str, ...]:
+    """What was chosen, why, and what was left out, in sentences."""
+    m, part = choice.measured, choice.measured.split
+    still, noise = np.sqrt(max(0.0, part.grid + part.uncovered)), np.sqrt(max(0.0, m.squared(choice.paths) - m.floor))
+    nodes = sum(int(np.prod(spec.shape)) for spec in specs_of(scene, m.grid))
+    return (
+        f"{m.grid} nodes along the longest axis: between them the light is off by {still:.1%}",
+        f"{choice.paths} paths: their noise, read between nodes, is {noise:.1%}",
+        f"{bounces} bounces: further ones would add {left_out:.1%}",
+        f"{nodes - m.nodes} of {nodes} nodes are left out: no isosurface of the range is near them",
+    )
+
+
+def planned(
+    scene: Scene,
+    backend: Backend,
+    levels: Levels,
+    *,
+    error: float | None = None,
+    seconds: float | None = None,
+    grid: int | None = None,
+    paths: int | None = None,
+    bounces: int | None = None,
+    seed: int = 0,
+) -> Plan:
+    """Choose nodes, paths and bounces of a run with `Direct` and `Nearest`.
+
+    Parameters
+    ----------
+    scene : Scene
+    backend : Backend
+        One that marches level sets.
+    levels : Levels
+        Rows at which walls are lit, which takes its time too.
+    error : float, optional
+        Relative root mean square error to reach, in the least time.
+    seconds : float, optional
+        Time to use, pilot included, for the least error.
+    grid, paths, bounces : int, optional
+        What is not left to choose.
+    seed : int
+    """
+    begun = time.perf_counter()
+    walls = sum(len(queries) for queries in wall_queries(scene, levels))
+    candidates = [grid] if grid else sizes(scene)
+    pace = timed(scene, backend, candidates[len(candidates) // 2], 32, 4, seed)
+    goal, left, points = 0.02 if error is None else error, np.inf, 1024
+    if seconds is not None:  # the first look takes a tenth of the time
+        left = JUDGED * seconds
+        points = int(np.clip(0.1 * left / pace.path / (2 * 8 * PATHS * len(candidates)), 96, 1024))
+    pilot = Pilot.start(scene, backend, points, goal, seed)
+    followed = pilot.bounces_for(SHARE * goal) if bounces is None else bounces
+    tried = _ladder(pilot, candidates, followed, pace, error, left)
+    choice = choose(tried, pace, walls, error, left, paths)
+    near = [m.grid for m in tried if 0.6 < m.grid / choice.measured.grid < 1.7]
+    # A closer look around it, at more points, for a sixth of the time that the run will take.
+    more = int(min(8192.0, choice.seconds / 6 / pace.path / (2 * 8 * PATHS * len(near))))
+    if more > 1.5 * points:
+        goal = choice.error if error is None else error
+        pilot = Pilot.start(scene, backend, more, goal, seed + 1)
+        followed = pilot.bounces_for(SHARE * goal) if bounces is None else bounces
+        fewer = pilot.fewer(followed)
+        tried = [pilot.measure(size, fewer, followed, PATHS) for size in near]
+    pace = timed(scene, backend, choice.measured.grid, choice.paths, followed, seed)
+    choice = choose(tried, pace, walls, error, left - (time.perf_counter() - begun), paths)
+    return Plan(
+        choice.measured.grid, choice.paths, followed, choice.error, choice.seconds, time.perf_counter() - begun,
+        choice.met, reasons(scene, choice, followed, pilot.left_out(followed)),
+    )  # fmt: skip
+
+
+def judge(scene: Scene, backend: Backend, grids: Sequence[IlluminationGrid], seed: int, points: int = 2048) -> Errors:
+    """How far grids are from converged light at points that neither they nor the pilot asked for."""
+    bounces = enough(scene, backend, 1e-3, seed)
+    truth = begin(scene, backend, unseen_in_volume(scene, points, seed + 2), bounces, seed + 2)
+    while True:
+        found = errors(look_up(grids, truth.samples.queries), truth)
+        paths = int(truth.samples.paths[0])
+        if truth.error <= found.rmse or paths >= 1024:
+            return found
+        truth = converge(truth, scene, backend, seed + 2, 0.0, 2 * paths)
+
+
+def helps(scene: Scene, backend: Backend, grid: int, bounces: int, seed: int) -> dict[str, float]:
+    """Relative error without noise of a grid as it is, with twice the nodes, and of a field that is smoothed."""
+    soft = replace(scene, fields=tuple(replace(f, volume=smooth(f.volume, 1.0)) for f in scene.fields))
+    found = {}
+    for what, of, nodes in (("now", scene, grid), ("finer", scene, 2 * grid), ("smooth", soft, grid)):
+        pilot = Pilot.start(of, backend, 1024, 0.05, seed)
+        found[what] = float(np.sqrt(pilot.measure(nodes, pilot.fewer(bounces), bounces, 32).floor))
+    return found

@@ -1,0 +1,181 @@
+"""Converged light at points that nobody asked for, and how far a grid is from it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from illumgrid.bake import light_left_out
+from illumgrid.grid import IlluminationGrid
+from illumgrid.samplers.direct import crossed_cells
+from illumgrid.samples import Queries, Samples, combine, join_queries
+from illumgrid.scene import Scene
+from illumgrid.stages import Backend, on_level_sets
+from illumgrid.volume import Floats, cell_gradient, index_to_world, interpolate
+
+MOST_BOUNCES = 128
+_STEPS = 64  # of the isovalue, within which points are uniform by area
+
+
+def apart(seed: int) -> int:
+    """A seed whose paths have nothing in common with those of `seed`."""
+    return (seed + 2**63) % 2**64
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """Light at unseen points, with its own error.
+
+    Parameters
+    ----------
+    samples : Samples
+        Answers from many paths; no holes.
+    bounces : int
+        Reflections that were followed.
+    surface : str
+        The stand-in for the level sets that the light met: "levelset" (trilinear) or "mesh" (marching cubes).
+    """
+
+    samples: Samples
+    bounces: int
+    surface: str = "levelset"
+
+    def __len__(self) -> int:
+        return len(self.samples)
+
+    @property
+    def light(self) -> Floats:
+        """Irradiance (n, 3)."""
+        return self.samples.mean.astype(float)
+
+    @property
+    def mean(self) -> float:
+        """Mean irradiance over points and colours, to which errors are relative."""
+        return float(self.samples.mean.mean(dtype=float))
+
+    @property
+    def variance(self) -> float:
+        """Mean squared standard error of the truth itself."""
+        return float(np.square(self.samples.stderr, dtype=float).mean())
+
+    @property
+    def error(self) -> float:
+        """Root mean square standard error of the truth itself, relative to the mean irradiance."""
+        return float(np.sqrt(self.variance)) / self.mean
+
+
+@dataclass(frozen=True)
+class Errors:
+    """How far a grid is from the truth, all relative to the mean irradiance.
+
+    Parameters
+    ----------
+    rmse : float
+        Root mean square over points and colours, the truth's own variance subtracted.
+    median, p95 : float
+        Median and 95th percentile over points of the root mean square over colours.
+    bias : float
+        Mean difference; below 0 the grid is too dark.
+    """
+
+    rmse: float
+    median: float
+    p95: float
+    bias: float
+
+
+def unseen_on_level_sets(scene: Scene, levels: int, points: int, seed: int) -> Queries:
+    """Points uniform by area on level sets that are drawn apart: one at random from each of `levels` equal steps.
+
+    Returns
+    -------
+    Queries
+        About `points` in all, on the trilinear level sets; every level set and field has as many.
+    """
+    random = np.random.default_rng((apart(seed), 1))
+    rows = scene.levels((np.arange(levels) + random.random(levels)) / levels)
+    each = max(1, round(points / (levels * len(scene.fields))))
+    found = join_queries(list(on_level_sets(scene, rows, apart(seed), points=each)))
+    return found[np.flatnonzero(found.normal.any(axis=1))]
+
+
+def unseen_in_volume(scene: Scene, points: int, seed: int) -> Queries:
+    """As `unseen_on_level_sets`, but each point on a level set of its own, and no surface is extracted.
+
+    By the co-area formula, points of a volume weighted by |∇h| are uniform by area on the level sets through them;
+    weights that add up to the same within each of 64 equal steps of the range make them uniform in the isovalue.
+    """
+    found = []
+    for number, field in enumerate(scene.fields):
+        random = np.random.default_rng((apart(seed), 2, number))
+        crossed = crossed_cells(field)
+        cells = np.flatnonzero(crossed)
+        if not len(cells):
+            continue
+        tried = random.choice(cells, max(1 << 15, 64 * points))
+        index = np.stack(np.unravel_index(tried, crossed.shape), axis=1) + random.random((len(tried), 3))
+        share = (interpolate(field.volume, index) - field.range[0]) / (field.range[1] - field.range[0])
+        kept = (share >= 0) & (share <= 1)
+        index, step = index[kept], np.minimum(share[kept] * _STEPS, _STEPS - 1).astype(int)
+        weight = np.linalg.norm(cell_gradient(field.volume, index), axis=1)
+        total = np.bincount(step, weight, minlength=_STEPS)
+        weight = weight / np.where(total > 0, total, 1.0)[step]
+        if weight.any():
+            # Systematic draws from the points in order of isovalue: the same number from every step, or nearly.
+            order = np.argsort(step, kind="stable")
+            mass = np.cumsum(weight[order]) / weight.sum()
+            chosen = order[np.searchsorted(mass, (np.arange(points) + random.random()) / points).clip(0, len(mass) - 1)]
+            world = index_to_world(field.volume, index[np.unique(chosen)])
+            found.append(Queries.at(scene, world, field=number, first_id=number << 40))
+    if not found:
+        return Queries.at(scene, np.zeros((0, 3)))
+    asked = join_queries(found)
+    return asked[np.flatnonzero(asked.normal.any(axis=1))]
+
+
+def enough(scene: Scene, backend: Backend, tolerance: float, seed: int) -> int:
+    """Reflections beyond which less than `tolerance` of all light is left out."""
+    bounces = 8
+    while bounces < MOST_BOUNCES and light_left_out(scene, backend, bounces, seed) > tolerance:
+        bounces *= 2
+    return bounces
+
+
+def trace(scene: Scene, backend: Backend, asked: Queries, paths: range, bounces: int, seed: int) -> Samples:
+    """Answers with paths that no run of this seed walks; holes (points inside another field's solid) stay in."""
+    return backend.solve(scene, asked, paths=paths, bounces=bounces, seed=apart(seed))
+
+
+def begin(scene: Scene, backend: Backend, asked: Queries, bounces: int, seed: int, paths: int = 64) -> Truth:
+    """Trace a few paths from each point; points inside another field's solid are left out."""
+    samples = trace(scene, backend, asked, range(paths), bounces, seed)
+    return Truth(samples[samples.paths > 0], bounces)
+
+
+def converge(truth: Truth, scene: Scene, backend: Backend, seed: int, error: float, paths: int = 1 << 14) -> Truth:
+    """Go on until the truth's own relative error is at most `error`, or `paths` paths from each point are spent."""
+    while len(truth) and truth.error > error and (done := int(truth.samples.paths[0])) < paths:
+        more = trace(scene, backend, truth.samples.queries, range(done, 2 * done), truth.bounces, seed)
+        truth = Truth(combine(truth.samples, more), truth.bounces)
+    return truth
+
+
+def look_up(grids: Sequence[IlluminationGrid], asked: Queries) -> Floats:
+    """Light (n, 3) that the grids hold at the points of queries, each in the grid of its field."""
+    light = np.zeros((len(asked), 3))
+    for number, grid in enumerate(grids):
+        own = asked.target == number
+        light[own] = grid.lookup(asked.point[own])
+    return light
+
+
+def errors(light: Floats, truth: Truth) -> Errors:
+    """How far `light` (n, 3), looked up at the points of a truth, is from it."""
+    off = (light - truth.light) / truth.mean
+    each = np.sqrt((off**2).mean(axis=1))
+    return Errors(
+        rmse=float(np.sqrt(max(0.0, (off**2).mean() - truth.error**2))),
+        median=float(np.median(each)),
+        p95=float(np.quantile(each, 0.95)),
+        bias=float(off.mean()),
+    )

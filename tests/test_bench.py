@@ -1,0 +1,204 @@
+"""The race and what is made of it."""
+
+import csv
+import json
+import warnings
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from illumgrid.backends.numba_ import Numba
+from illumgrid.bench import _remarks, bench, chart, told
+from illumgrid.bench import sizes as sizes_of
+from illumgrid.bench.contestants import COUNTS, Way, ways
+from illumgrid.bench.race import Point, Race, Run, covered, front
+from illumgrid.bench.whence import Bar
+from illumgrid.interpolators.nearest import Nearest
+from illumgrid.samplers.direct import Direct
+from illumgrid.samplers.uniform import Uniform
+from illumgrid.samples import Samples
+from illumgrid.scene import Scene
+from illumgrid.split import Split
+from illumgrid.truth import Truth, begin, errors, unseen_on_level_sets
+from shapes import ball, refused, sky
+
+BACKEND = Numba()
+WAY = Way(Direct(), BACKEND, "levelset", (Nearest(),))
+
+
+def scene_of(n=14):
+    return Scene.floor(ball(n), range=(0.4, 0.9))
+
+
+@pytest.fixture(scope="module")
+def truth():
+    scene = scene_of()
+    return scene, begin(scene, BACKEND, unseen_on_level_sets(scene, 8, 200, 0), 8, 0, 256)
+
+
+def point(truth, seconds, off, grid=8, paths=4, way=WAY, seeds=3):
+    made = Point(way, way.interpolators[0], grid, paths, 100, np.ones(len(truth), bool))
+    made.seconds = [seconds] * seeds
+    made.light = [truth.light + np.hypot(off, truth.error) * truth.mean] * seeds
+    return made
+
+
+def split_of(noise, grid=0.0):
+    return Split(noise**2, grid**2, 0.0, 1e-6, 0.0, 1e-6)
+
+
+BARS = (Bar(8, 16, split_of(0.05, 0.02)), Bar(8, 64, split_of(0.01, 0.02)), Bar(16, 16, split_of(0.04)))
+
+
+def test_the_front_is_what_nobody_beats(truth):
+    _, exact = truth
+    points = [point(exact, s, e) for s, e in ((1, 0.1), (2, 0.05), (3, 0.07), (4, 0.02), (0.5, 0.3), (4.1, 0.02))]
+    assert [p.seconds[0] for p in front(points, {"levelset": exact})] == [0.5, 1, 2, 4]
+
+
+def test_the_errors_of_a_point_have_the_truths_variance_subtracted(truth):
+    _, exact = truth
+    assert point(exact, 1, 0.1).rmse(exact) == pytest.approx(0.1, rel=1e-6)
+    assert errors(exact.light, exact).rmse == 0.0
+
+
+def test_a_race_goes_from_cheap_to_dear_and_keeps_its_seeds(truth):
+    scene, exact = truth
+    denser = Way(Uniform(32), BACKEND, "levelset", (Nearest(),))
+    race = Race(
+        scene, {"levelset": exact}, [WAY, Way(Uniform(8), BACKEND, "levelset", (Nearest(),), denser)], [4, 7], 3, 0
+    )
+    while lane := race.next(np.inf):
+        race.step(lane)
+        assert len(race.points) < 60
+    assert {p.label for p in race.points} >= {"direct, numba, nearest", "uniform 8, numba, nearest"}
+    assert {p.grid for p in race.points if p.way is WAY} == {4, 7}
+    for p in race.points:
+        assert len(p.light) == 1 and p.light[0].shape == (len(exact), 3) and p.seconds[0] > 0
+    race.repeat(np.inf, lambda: None)
+    best = front(race.points, race.truths)
+    assert all(len(p.seconds) == 3 for p in best)
+    assert all(not np.array_equal(p.light[0], p.light[1]) for p in best if p.rmse(exact) > 1e-3)
+
+
+def test_a_run_that_goes_on_is_the_run_with_more_paths(truth):
+    scene, _ = truth
+    halting, straight = Run(scene, WAY, 7, 3, 5), Run(scene, WAY, 7, 3, 5)
+    for paths in (4, 16, 64):
+        halting.go_on(paths)
+    straight.go_on(64)
+    one, other = (run.fill(Nearest())[0][0].values for run in (halting, straight))
+    np.testing.assert_allclose(one, other, rtol=1e-5)
+
+
+def test_covered_points_read_only_nodes_with_light(truth):
+    scene, exact = truth
+    run = Run(scene, WAY, 9, 1, 0)
+    run.go_on(4)
+    (grid,), _ = run.fill(Nearest())
+    asked = exact.samples.queries
+    assert covered([replace(grid, support=np.ones_like(grid.support))], asked).all()
+    assert not covered([replace(grid, support=np.zeros_like(grid.support))], asked).any()
+
+
+def test_everything_that_is_registered_takes_part_or_is_told(truth):
+    scene, exact = truth
+    entrants, notes = ways(scene, exact.samples.queries, 1e6)
+    names = {(w.sampler.name, w.backend.name) for w in entrants}
+    assert {("direct", "numba"), ("uniform", "numba"), ("direct", "reference")} <= names
+    chain = next(w for w in entrants if w.sampler.name == "uniform")
+    assert chain.sampler.count == COUNTS[0] and chain.denser.sampler.count == COUNTS[1]
+    few, notes = ways(scene, exact.samples.queries, 1e-6)
+    assert {w.backend.name for w in few} == {"numba"}  # the fastest is never too slow
+    assert any("reference takes no part: 64 queries" in note for note in notes)
+
+
+def test_the_advice_names_the_fastest_that_is_good_enough_and_what_is_missing(truth):
+    _, exact = truth
+    truths = {"levelset": exact}
+    points = [point(exact, 1, 0.09, 8, 16), point(exact, 4, 0.025, 8, 64)]
+    records = [told.record(p, truths, True) for p in points]
+    said = told.advice(records, BARS, 5)
+    assert said[0].startswith("for 3% use --sampler direct --backend numba --interpolator nearest --grid 8 --paths 64")
+    assert said[1].startswith("for 10% use") and "--paths 16 --bounces 5 (1 s, error 9.00%)" in said[1]
+    assert "1% was not reached" in said[2] and "the grid's: more nodes" in said[2]
+    assert "noise: more paths" in told.advice(records[:1], BARS, 5)[-1]
+    paper = told.record(point(exact, 1, 0.2, way=Way(Uniform(8), BACKEND, "levelset", (Nearest(),))), truths, False)
+    assert "--isovalues 8 " in told.options(paper, 4)
+    table = told.table([*records, paper])
+    assert table.index("the front:") < table.index("direct") < table.index("the best of the others:")
+
+
+def test_remarks_tell_a_blunt_truth_and_missing_seeds(truth):
+    _, exact = truth
+    samples = exact.samples
+    blunt = Truth(Samples(samples.queries, samples.mean, samples.m2 + 1000, samples.paths), 8)
+    said = _remarks((point(blunt, 1, 0.01, seeds=1),), {"levelset": blunt})
+    assert "more than a fifth" in said[0] and "fewer than 3 seeds" in said[1]
+    assert not _remarks((point(exact, 1, 0.5),), {"levelset": exact})
+
+
+def test_the_chart_can_be_drawn_of_one_point_and_of_many(truth):
+    _, exact = truth
+    records = [
+        told.record(point(exact, s, 0.1 / s, seeds=k), {"levelset": exact}, s < 3) for s, k in ((1, 3), (2, 1), (3, 1))
+    ]
+    for some in (records[:1], records):
+        figure = chart.draw(some, BARS, "a ball")
+        left, right = figure.axes
+        assert left.get_xscale() == left.get_yscale() == "log" and "seconds" in left.get_xlabel()
+        assert "direct, numba, nearest" in [t.get_text() for t in left.get_legend().get_texts()]
+        heights = [sum(bars[k].get_height() for bars in right.containers if hasattr(bars, "patches")) for k in range(3)]
+        np.testing.assert_allclose(
+            heights, [100 * np.sqrt(sum(vars(b.split).values()) - 1e-6) for b in BARS], rtol=1e-3
+        )
+    assert chart.image(figure, "png").startswith(b"\x89PNG") and b"<svg" in chart.image(figure, "svg")
+
+
+def test_grids_of_a_quarter_to_twice_the_voxels():
+    assert sizes_of(sky(ball(20))) == [5, 10, 20, 40]
+
+
+def test_a_budget_or_a_scene_that_cannot_be_is_refused():
+    refused(lambda: bench(sky(), 0.0), "budget of 0 seconds", "such as 60")
+
+
+def test_bench_writes_what_it_says_whole_and_once(call, tmp_path):
+    arguments = ("bench", "v.npy", "--range", 0.3, 0.9, "--budget", 4, "-o", "b")
+    said = call(*arguments)
+    assert "the front:" in said and "for 10% use --sampler" in said and "wrote b" in said
+    assert sorted(p.name for p in (tmp_path / "b").iterdir()) == ["bench.csv", "bench.json", "chart.png", "chart.svg"]
+    found = json.loads((tmp_path / "b" / "bench.json").read_text())
+    assert found["truth"]["levelset"]["points"] >= 1000 and found["truth"]["levelset"]["isovalues"] >= 8
+    assert found["parts"] and found["advice"] and found["bounces"] >= 0
+    rows = list(csv.DictReader((tmp_path / "b" / "bench.csv").read_text().splitlines()))
+    assert (
+        len(rows) == len(found["points"]) and {"seconds", "rmse", "bias", "p95", "flip", "memory_mb"} <= rows[0].keys()
+    )
+    assert "new folder" in call(*arguments, code=2)
+
+
+def test_bench_refuses_before_anything_runs(refuse, tmp_path):
+    refuse("bench", "nowhere.npy", words=["nowhere.npy"])
+    refuse("bench", "v.npy", "--budget", 0, words=["budget"])
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "notes.txt").write_text("mine")
+    refuse("bench", "v.npy", "-o", "mine", words=["mine", "new folder"])
+
+
+def test_run_tells_the_error_that_it_reached_and_what_it_chose(call, tmp_path):
+    said = call("run", "v.npy", "--range", 0.3, 0.9, "--error", 0.1, "--no-preview", "-o", "e")
+    assert "nodes along the longest axis" in said and "error reached" in said and "the pilot said" in said
+    recipe = json.loads((tmp_path / "e" / "run.json").read_text())["recipe"]
+    assert recipe["plan"]["why"] and recipe["reached"]["rmse"] < 0.13
+    assert "error reached" in call("run", "v.npy", "--range", 0.3, 0.9, "--grid", 5, "--no-preview", "-o", "plain")
+
+
+def test_run_says_what_would_help_noisy_data(call, tmp_path):
+    noise = np.random.default_rng(0).normal(size=(16, 16, 16))
+    np.save(tmp_path / "noise.npy", ball(16).values + 0.2 * noise.astype(np.float32))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        said = call("run", "noise.npy", "--range", 0.4, 0.7, "--grid", 12, "--no-preview", "-o", "n")
+    assert "note: grid: between the nodes" in said and "--smooth 1" in said

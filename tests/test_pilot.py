@@ -1,0 +1,232 @@
+"""What the pilot knows before a grid is built, against grids that are built."""
+
+import numpy as np
+import pytest
+
+from illumgrid import run
+from illumgrid.backends.numba_ import Numba
+from illumgrid.grid import IlluminationGrid
+from illumgrid.pilot import Measured, Pace, Pilot, corners
+from illumgrid.plan import choose, judge, planned, sizes
+from illumgrid.samples import Queries, Samples
+from illumgrid.scene import Scene, level_table
+from illumgrid.split import Split, split
+from illumgrid.truth import Truth, apart, begin, converge, errors, look_up, unseen_in_volume, unseen_on_level_sets
+from illumgrid.volume import interpolate, world_to_index
+from shapes import ball, refused, sampled, sky
+
+BACKEND = Numba()
+
+
+def bumps(n, count, seed, widths=(0.15, 0.4)):
+    """Sum of Gaussians of random place and width, on -1 to 1."""
+    random = np.random.default_rng(seed)
+    centres, sigmas = random.uniform(-0.6, 0.6, (count, 3)), random.uniform(*widths, count)
+
+    def density(x):
+        return sum(np.exp(-((x - c) ** 2).sum(axis=1) / (2 * s * s)) for c, s in zip(centres, sigmas))
+
+    return sampled(density, (n, n, n), (-1, -1, -1), np.full(3, 2 / (n - 1)))
+
+
+def gyroid(n):
+    """A labyrinth of channels."""
+
+    def value(x):
+        a, b, c = (4.5 * x).T
+        return np.sin(a) * np.cos(b) + np.sin(b) * np.cos(c) + np.sin(c) * np.cos(a)
+
+    return sampled(value, (n, n, n), (-1, -1, -1), np.full(3, 2 / (n - 1)))
+
+
+FIELDS = {
+    "bumps": lambda: Scene.sky(bumps(22, 24, 1, (0.12, 0.22)), range=(0.3, 0.9)),
+    "few bumps": lambda: Scene.sky(bumps(24, 9, 4, (0.12, 0.25)), range=(0.2, 0.7)),
+    "labyrinth": lambda: Scene.sky(gyroid(22), range=(-0.4, 0.4)),
+    "on a floor": lambda: Scene.floor(ball(20), range=(0.4, 0.9)),
+    "dents": lambda: Scene.sky(bumps(24, 10, 7), range=(0.4, 1.0), inside="below"),
+}
+
+
+def off(light, scene, truth):
+    return errors(look_up(light.grids, truth.samples.queries), truth).rmse
+
+
+@pytest.fixture(scope="module")
+def truths():
+    made = {}
+    for name, make in FIELDS.items():
+        scene = make()
+        asked = unseen_on_level_sets(scene, 16, 1600, seed=50)
+        made[name] = scene, converge(begin(scene, BACKEND, asked, 16, seed=50), scene, BACKEND, 50, 0.01, 128)
+    return made
+
+
+def test_unseen_points_lie_on_level_sets_of_the_range_evenly_in_isovalue_and_in_area():
+    scene = sky(ball(40), (0.4, 1.0))
+    for asked in (unseen_in_volume(scene, 4000, 3), unseen_on_level_sets(scene, 40, 4000, 3)):
+        assert 3500 < len(asked) <= 4000
+        found = interpolate(scene.fields[0].volume, world_to_index(scene.fields[0].volume, asked.point))
+        np.testing.assert_allclose(found, asked.level[:, 0], atol=1e-6)
+        share = (asked.level[:, 0] - 0.4) / 0.6
+        assert share.min() >= 0 and share.max() <= 1
+        # 8 bins of 500: binomial spread 21; stratified draws have less.
+        assert np.abs(np.histogram(share, 8, (0, 1))[0] / len(asked) * 4000 - 500).max() < 70
+        height = asked.point[:, 2] / np.linalg.norm(asked.point, axis=1)  # uniform on a sphere (Archimedes)
+        assert np.abs(np.histogram(height, 5, (-1, 1))[0] / len(asked) - 0.2).max() < 0.03
+
+
+def test_unseen_points_differ_from_seed_to_seed_and_the_truth_walks_other_paths():
+    scene = sky()
+    one, other = (unseen_in_volume(scene, 100, seed).point for seed in (0, 1))
+    assert not np.isin(one[:, 0], other[:, 0]).any()
+    assert apart(0) != 0 and apart(apart(5)) == 5
+
+
+def test_corners_hold_exactly_what_a_lookup_in_the_built_grid_reads():
+    scene = FIELDS["bumps"]()
+    asked = unseen_in_volume(scene, 300, 0)
+    for nodes in (9, 22, 31):
+        light = run(scene, grid=nodes, paths=8, bounces=2, seed=5)
+        around = corners(scene, nodes, asked)
+        read, covered = around.read(BACKEND.solve(scene, around.asked, paths=range(8), bounces=2, seed=5))
+        assert covered.mean() > 0.5 and around.nodes == light.recipe["queries"]
+        np.testing.assert_allclose(read[covered], look_up(light.grids, asked)[covered], rtol=2e-5)
+
+
+def test_the_split_finds_parts_that_were_put_in():
+    random, n = np.random.default_rng(0), 40_000
+    scene = sky()
+    asked = Queries.at(scene, np.zeros((n, 3)))
+    exact = 2.0 + 0.3 * random.normal(size=(n, 1)) * np.ones((1, 3))
+    paths, own = 64, 0.02  # the truth is itself noisy
+    noise = own * random.normal(size=(n, 3))
+    m2 = np.full((n, 3), own**2 * paths * (paths - 1), np.float32)
+
+    def samples(mean):
+        return Samples(asked, mean.astype(np.float32), m2, np.full(n, paths, np.int32))
+
+    truth, fewer = Truth(samples(exact + noise), 9), samples(exact - 0.06 + noise)
+    grid = 0.1 * random.normal(size=(n, 1))
+    covered = np.arange(n) % 4 > 0
+    grid[~covered] *= 3
+    one, other = (exact - 0.06 + grid + 0.08 * random.normal(size=(n, 3)) for _ in range(2))
+    found = split(one, other, covered, fewer, truth)
+    assert found.noise == pytest.approx(0.08**2 / 4, rel=0.03)
+    assert found.grid == pytest.approx(0.75 * 0.1**2 / 4, rel=0.06)
+    assert found.uncovered == pytest.approx(0.25 * 0.3**2 / 4, rel=0.06)
+    assert found.bounces == pytest.approx(0.06**2 / 4, rel=0.01)
+    assert found.total == pytest.approx(((one - exact) ** 2).mean() / 4, rel=0.03)
+    assert 0 < found.uncertain < 0.1 * found.grid
+
+
+def test_the_measured_noise_is_that_of_two_built_grids():
+    scene, nodes = FIELDS["few bumps"](), 24
+    pilot = Pilot.start(scene, BACKEND, 1500, 0.05, 0)
+    found = pilot.measure(nodes, pilot.fewer(3), 3, 16)
+    one, other = (
+        look_up(run(scene, grid=nodes, paths=16, bounces=3, seed=s).grids, pilot.truth.samples.queries) for s in (8, 9)
+    )
+    built = ((one - other) ** 2).mean() / 2 / pilot.truth.mean**2
+    assert found.split.noise == pytest.approx(built, rel=0.25)
+
+
+def test_more_bounces_leave_less_out():
+    pilot = Pilot.start(FIELDS["labyrinth"](), BACKEND, 512, 0.05, 0)
+    left = [pilot.left_out(bounces) for bounces in (0, 1, 2, 4, 8)]
+    assert left == sorted(left, reverse=True) and left[0] > 0.05
+    chosen = pilot.bounces_for(0.01)
+    assert pilot.left_out(chosen) <= 0.01 < pilot.left_out(chosen - 1)
+
+
+def measured(grid, floor, noise=0.04, paths=16, nodes=None):
+    parts = Split(noise=noise**2, grid=floor**2, uncovered=0, bounces=0, cross=0, uncertain=0)
+    return Measured(grid, nodes or grid**3, parts, paths)
+
+
+PACE = Pace(1e-5, 1e-6)
+
+
+def test_the_least_time_for_an_error_and_the_least_error_for_a_time():
+    tried = [measured(10, 0.05), measured(20, 0.02), measured(40, 0.005)]
+    for goal in (0.01, 0.03, 0.06):
+        choice = choose(tried, PACE, 0, goal, np.inf, None)
+        assert choice.met and choice.error == pytest.approx(goal, rel=0.1)
+        others = [PACE.seconds(m.nodes, n) for m in tried if (n := m.paths_for(goal**2))]
+        assert choice.seconds == min(others)
+    for seconds in (0.05, 0.5, 5.0):
+        choice = choose(tried, PACE, 0, None, seconds, None)
+        assert choice.met and choice.seconds <= seconds * 1.001
+        counts = [PACE.paths_in(seconds, m.nodes) for m in tried]
+        assert choice.error == min(m.squared(n) ** 0.5 for m, n in zip(tried, counts) if n >= 4)
+
+
+def test_what_cannot_be_had_is_said():
+    choice = choose([measured(10, 0.05), measured(20, 0.02)], PACE, 0, 0.01, np.inf, None)
+    assert not choice.met and choice.measured.grid == 20 and choice.error == pytest.approx(0.02 * 1.25**0.5, rel=0.05)
+    assert not choose([measured(40, 0.005)], PACE, 0, None, 1e-3, None).met
+    fixed = choose([measured(20, 0.02)], PACE, 0, 0.03, np.inf, 7)
+    assert fixed.paths == 7 and not fixed.met
+
+
+def test_walls_take_their_time():
+    tried = [measured(20, 0.02)]
+    without, beside = (choose(tried, PACE, walls, None, 1.0, None) for walls in (0, 20**3))
+    assert beside.paths < 0.6 * without.paths
+
+
+def test_sizes_go_up_to_twice_the_voxels():
+    found = sizes(sky(ball(20)))
+    assert found == sorted(found) and found[-1] == 40 and 20 in found
+
+
+def test_an_asked_error_is_met_nine_times_in_ten(truths):
+    ratios = {}
+    for name, (scene, truth) in truths.items():
+        for error in (0.05, 0.02):
+            plan = planned(scene, BACKEND, level_table(scene, 4), error=error, seed=1)
+            assert plan.met and plan.error <= 1.05 * error
+            light = run(scene, grid=plan.grid, paths=plan.paths, bounces=plan.bounces, isovalues=4, seed=1)
+            ratios[name, error] = off(light, scene, truth) / error
+    assert len(ratios) == 10
+    assert sum(ratio <= 1.3 for ratio in ratios.values()) >= 9, ratios
+
+
+def test_the_judgement_agrees_with_a_truth(truths):
+    scene, truth = truths["labyrinth"]
+    light = run(scene, grid=14, paths=16, seed=0)
+    assert judge(scene, BACKEND, light.grids, 0).rmse == pytest.approx(off(light, scene, truth), rel=0.2)
+
+
+def test_run_tells_what_it_chose_and_what_it_reached():
+    scene = FIELDS["few bumps"]()
+    recipe = run(scene, error=0.05, seed=0).recipe
+    assert recipe["plan"]["met"] and recipe["grid"] == recipe["plan"]["grid"]
+    assert recipe["paths"] == recipe["plan"]["paths"] and len(recipe["plan"]["why"]) == 4
+    assert recipe["reached"]["rmse"] <= 1.3 * 0.05
+    kept = run(scene, seconds=1.0, grid=12, bounces=3, seed=0).recipe
+    assert kept["grid"] == 12 and kept["bounces"] == 3
+    assert run(scene, grid=8, paths=2, bounces=1).recipe["plan"] is None
+
+
+def test_what_no_pilot_can_plan_is_refused():
+    scene = sky()
+    refused(lambda: run(scene, error=0.1, seconds=3.0), "both", "one of them")
+    refused(lambda: run(scene, error=0.0), "error of 0", "0.03")
+    refused(lambda: run(scene, seconds=-1.0), "-1 seconds")
+    refused(lambda: run(scene, error=0.1, sampler="uniform"), "uniform", "direct", "bench")
+    dark = Scene(scene.fields)
+    refused(lambda: run(dark, error=0.1), "no light", "background")
+
+
+def test_errors_of_a_known_difference():
+    scene = sky()
+    grid = run(scene, grid=6, paths=4, bounces=0).grids[0]
+    asked = unseen_in_volume(scene, 50, 0)
+    n = len(asked)
+    rgb = np.ones((n, 3), np.float32)
+    truth = Truth(Samples(asked, 2 * rgb, 0 * rgb, np.full(n, 9, np.int32)), 1)
+    flat = IlluminationGrid(grid.spec, np.full_like(grid.values, 2.2), grid.error, grid.support)
+    found = errors(look_up([flat], asked), truth)
+    for value in (found.rmse, found.median, found.p95, found.bias):
+        assert value == pytest.approx(0.1, rel=1e-4)
