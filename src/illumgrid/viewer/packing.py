@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from illumgrid.grid import GridSpec, IlluminationGrid
 from illumgrid.levelset import turned, upward
-from illumgrid.preview.camera import HALF_ANGLE, outline_of, fit_camera
+from illumgrid.preview.camera import HALF_ANGLE, fit_camera, outline_of
 from illumgrid.preview.shade import BACKGROUND, CAP_TONE
 from illumgrid.scene import Field, Scene, upright
 from illumgrid.tone import WHITE, encode_srgb
