@@ -82,7 +82,7 @@ def corners(lattice: Lattice) -> Floats:
     return index_to_world(lattice, np.array(list(np.ndindex(2, 2, 2))) * (np.array(lattice.shape) - 1))
 
 
-def _outline(scene: Scene, row: Floats) -> Floats:
+def outline_of(scene: Scene, row: Floats) -> Floats:
     """World points (m, 3) whose hull is that of walls, and of the solids under a row of levels (volumes if none)."""
     found = []
     for field, level in zip(scene.fields, row * upward(scene)):
@@ -120,7 +120,7 @@ def fit_camera(scene: Scene, row: Floats, aspect: float, view: View = None, zoom
     zoom : float
         Enlarges the middle of the picture.
     """
-    outline = _outline(scene, row)
+    outline = outline_of(scene, row)
     if view is None:
         extent = np.ptp(outline @ np.stack(upright(scene.fields[0].volume.direction), axis=1), axis=0)
         flat, closed = extent[2] < 0.5 * extent[:2].min(), not scene.background.any()

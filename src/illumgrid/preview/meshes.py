@@ -35,14 +35,15 @@ def triangles(shown: Shown, eye: Floats) -> list[Colored]:
     """Surfaces, caps and walls of one setting of the sweep as they are seen from `eye`; walls from their front only."""
     found = []
     for number, field in enumerate(shown.scene.fields):
-        found += _solid(shown, number, field, eye)
+        found += solid(shown, number, field, eye)
     for number, quad in enumerate(shown.scene.quads):
         if (eye - quad.corner) @ quad.normal > 0:
-            found.append(_wall(shown, number, eye))
+            found.append(wall(shown, number, eye))
     return found
 
 
-def _solid(shown: Shown, number: int, field: Field, eye: Floats) -> list[Colored]:
+def solid(shown: Shown, number: int, field: Field, eye: Floats) -> list[Colored]:
+    """The level set of one field, and its caps."""
     mesh = isosurface(field.volume, float(shown.row[number]), field.inside, capped=True)
     if not len(mesh.faces):
         return []
@@ -72,7 +73,8 @@ def squares(nu: int, nv: int) -> NDArray[np.int64]:
     return np.asarray((corner + np.array([[0, nv, nv + 1, 0, nv + 1, 1]])).reshape(-1, 3))
 
 
-def _wall(shown: Shown, number: int, eye: Floats) -> Colored:
+def wall(shown: Shown, number: int, eye: Floats) -> Colored:
+    """One quad, its triangles wound so that the front is theirs."""
     quad = shown.scene.quads[number]
     nu, nv = (WALL_STEPS * n + 1 for n in quad.texels)
     u, v = (x.ravel() for x in np.meshgrid(np.linspace(0, 1, nu), np.linspace(0, 1, nv), indexing="ij"))

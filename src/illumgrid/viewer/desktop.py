@@ -10,7 +10,7 @@ import numpy as np
 
 from illumgrid.errors import BadInput
 from illumgrid.preview.camera import fit_camera
-from illumgrid.preview.meshes import _solid, _wall
+from illumgrid.preview.meshes import solid, wall
 from illumgrid.preview.shade import BACKGROUND, Shown
 from illumgrid.tone import encode_srgb
 
@@ -66,8 +66,8 @@ class Window:
         low, high = scene.fields[0].range
         shown = Shown(self.light, row, float(np.clip((isovalue - low) / (high - low), 0.0, 1.0)), False)
         eye = np.asarray(self.plotter.camera.position, float)
-        solids = [piece for k, field in enumerate(scene.fields) for piece in _solid(shown, k, field, eye)]
-        walls = [_wall(shown, k, eye) for k in range(len(scene.quads))]
+        solids = [piece for k, field in enumerate(scene.fields) for piece in solid(shown, k, field, eye)]
+        walls = [wall(shown, k, eye) for k in range(len(scene.quads))]
         for number in range(2 * len(scene.fields) + len(walls)):  # what this isovalue does not have goes
             self.plotter.remove_actor(f"piece {number}", reset_camera=False, render=False)
         for number, piece in enumerate(solids + walls):

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from illumgrid.grid import GridSpec, IlluminationGrid
 from illumgrid.levelset import turned, upward
-from illumgrid.preview.camera import HALF_ANGLE, _outline, fit_camera
+from illumgrid.preview.camera import HALF_ANGLE, fit_camera, outline_of
 from illumgrid.preview.shade import BACKGROUND, CAP_TONE
 from illumgrid.scene import Field, Scene, upright
 from illumgrid.tone import WHITE, encode_srgb
@@ -224,7 +224,7 @@ def _opening(scene: Scene, stage: Stage) -> dict[str, Any]:
     row = scene.levels(0.5)[0]
     right, front, up = upright(scene.fields[0].volume.direction)
     forward = fit_camera(scene, row, 1.0).forward
-    points = stage.place(_outline(scene, row))
+    points = stage.place(outline_of(scene, row))
     try:
         points = points[ConvexHull(points).vertices]
     except (QhullError, ValueError):  # flat, or too few: its box is a hull too
