@@ -308,7 +308,7 @@ def meet_quad(scene, q, x, d):
 
 
 @jit
-def march_from(scene, f, level, x, d, own, face, limit):
+def march_from(scene, f, level, x, n, d, own, face, limit):
     """First meeting of the frame ray x + t d with field f's trilinear solid, t < limit: (t, what, axis of a cap).
 
     `own`: the ray starts on that solid, at a cap if `face` says so; then the convex box cannot be met again.
@@ -337,19 +337,20 @@ def cast_from(scene, f, x, d, limit):
 
 
 @jit
-def mesh_from(scene, f, level, x, d, own, face, limit):
+def mesh_from(scene, f, level, x, n, d, own, face, limit):
     """First meeting of the frame ray x + t d with field f's mesh, t < limit: (t, what, face).
 
-    `own`: the ray starts on that mesh, on `face`. If it goes under the face it has met it at once; else it starts off
-    the face by what rounding may do. If it meets a back after that, it went under a neighbour.
+    It starts on a surface of normal n, and if `own` on this mesh, on `face`. If it goes under that face it has met it at
+    once; else it starts off by what rounding may do. If it meets a back after that, it went under a neighbour.
     """
+    off = scene.off[f]
     if own:
-        facing, off = scene.facing[face], scene.off[f]
-        if dot(facing, d) <= 0.0:
+        n = (scene.facing[face, 0], scene.facing[face, 1], scene.facing[face, 2])
+        if dot(n, d) <= 0.0:
             return 0.0, SURFACE, face
         if scene.cap[face]:
             return np.inf, MISS, NOWHERE
-        x = (x[0] + off * facing[0], x[1] + off * facing[1], x[2] + off * facing[2])
+    x = (x[0] + off * n[0], x[1] + off * n[1], x[2] + off * n[2])
     t, met, front = cast_from(scene, f, x, d, limit)
     if met == NOWHERE:
         return np.inf, MISS, NOWHERE
@@ -362,8 +363,10 @@ meet_solid = either(march_from, mesh_from)
 
 
 @jit
-def nearest_hit(scene, level, x, d, on, on_face):
+def nearest_hit(scene, level, x, n, d, on, on_face):
     """First surface along the frame ray x + t d, from surface number `on` (-1: from nowhere): (t, number, what, face).
+
+    The ray starts on a surface of normal n, 0 if on none.
 
     `face` is the axis of a cap, or of a mesh the face; `on_face` is that of the start. Fields count from 0, quads follow.
     A quad cannot be met again; the level set itself can.
@@ -376,7 +379,7 @@ def nearest_hit(scene, level, x, d, on, on_face):
             if t < best:
                 best, number, what, face = t, fields + q, QUAD, NOWHERE
     for f in range(fields):
-        t, hit, at = meet_solid(scene, f, level[f], x, d, f == on, on_face, best)
+        t, hit, at = meet_solid(scene, f, level[f], x, n, d, f == on, on_face, best)
         if hit != MISS and t < best:
             best, number, what, face = t, f, hit, at
     return best, number, what, face
@@ -501,7 +504,9 @@ def in_solid(scene, f, level, x, n):
 
 @jit
 def in_mesh(scene, f, level, x, n):
-    """Whether the frame point x lies inside the mesh of field f: whether a ray along n sees its back."""
+    """Whether the frame point x lies inside the mesh of field f, or on it: whether a ray from beside x along n sees a back."""
+    off = scene.off[f]
+    x = (x[0] + off * n[0], x[1] + off * n[1], x[2] + off * n[2])
     _, face, front = cast_from(scene, f, x, n, np.inf)
     return face != NOWHERE and not front
 
@@ -528,18 +533,20 @@ def stay(scene, own, x, n):
 def settle(scene, own, x, n):
     """Move a query along its normal onto its own mesh, which lies a little beside the trilinear set: (position, face).
 
-    Against the normal there is a front to be met, or along it a back: the nearer one within a cell.
+    Against the normal there should be a front, or along it a back: the nearer one within a cell. Where the two normals
+    disagree so much that there is neither, any face will do.
     """
     if own >= scene.start.shape[0]:
         return x, NOWHERE
-    found, shift, face, near = np.inf, 0.0, LOST, 2.0 * scene.off[own]
+    found, shift, face, near, reach = np.inf, 0.0, LOST, 2.0 * scene.off[own], scene.reach[own]
     for k in range(2):
         along = 2.0 * k - 1.0
         d = (along * n[0], along * n[1], along * n[2])
         start = (x[0] - near * d[0], x[1] - near * d[1], x[2] - near * d[2])
-        t, met, front = cast_from(scene, own, start, d, near + scene.reach[own])
-        if met != NOWHERE and front == (k == 0) and abs(t - near) < found:
-            found, shift, face = abs(t - near), along * (t - near), met
+        t, met, front = cast_from(scene, own, start, d, near + reach)
+        away = abs(t - near) + (0.0 if front == (k == 0) else reach)
+        if away < found:
+            found, shift, face = away, along * (t - near), met
     return (x[0] + shift * n[0], x[1] + shift * n[1], x[2] + shift * n[2]), face
 
 
@@ -585,7 +592,7 @@ def light_from_lamps(scene, choice, u, v, level, on, on_face, x, n):
     if by_cosine <= 0.0 or by_lamp <= 0.0 or number == on:
         return 0.0, q
     # The ray that meets this lamp first has met nothing else before.
-    _, met, _, _ = nearest_hit(scene, level, x, d, on, on_face)
+    _, met, _, _ = nearest_hit(scene, level, x, n, d, on, on_face)
     return (by_cosine / (by_cosine + by_lamp) if met == number else 0.0), q
 
 
@@ -613,7 +620,7 @@ def walk(scene, key, path, bounces, level, own, own_face, x, n):
         d = cosine_direction(u1, u2, n[0], n[1], n[2])
 
         # Follow the ray to the nearest surface; one that dips under its own has hit it already.
-        t, number, what, face = nearest_hit(scene, level, x, d, on, on_face)
+        t, number, what, face = nearest_hit(scene, level, x, n, d, on, on_face)
 
         # A path that escapes sees the background, and ends.
         if what == MISS:
@@ -707,17 +714,17 @@ def cast_rays(scene, level, origin, direction, on, t, number, what, normal):
 
     Rays from nowhere (`on` is -1) are those of a camera: they see the fronts of quads only.
     """
-    fields = scene.start.shape[0]
+    fields, none = scene.start.shape[0], (0.0, 0.0, 0.0)
     for i in range(origin.shape[0]):
         x, d = (origin[i, 0], origin[i, 1], origin[i, 2]), (direction[i, 0], direction[i, 1], direction[i, 2])
         through, start, passed = on, x, 0.0
-        t[i], number[i], what[i], face = nearest_hit(scene, level, x, d, on, NOWHERE)
+        t[i], number[i], what[i], face = nearest_hit(scene, level, x, none, d, on, NOWHERE)
         while on < 0 and what[i] == QUAD and dot(scene.quad_normal[number[i] - fields], d) >= 0.0:
             # A wall seen from behind is not there: go on from it.
             passed += t[i]
             through = number[i]
             start = (x[0] + passed * d[0], x[1] + passed * d[1], x[2] + passed * d[2])
-            t[i], number[i], what[i], face = nearest_hit(scene, level, start, d, through, NOWHERE)
+            t[i], number[i], what[i], face = nearest_hit(scene, level, start, none, d, through, NOWHERE)
         t[i] += passed
         if what[i] != MISS and what[i] != BURIED:
             hit = (x[0] + t[i] * d[0], x[1] + t[i] * d[1], x[2] + t[i] * d[2])
