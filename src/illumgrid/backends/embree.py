@@ -25,6 +25,7 @@ from illumgrid.backends.reference import (
     Bools,
     Ints,
     answer,
+    cell_normal,
     gradient_normal,
 )
 from illumgrid.errors import BadInput
@@ -55,9 +56,11 @@ class Casting:
     def first(self, f: int, x: Floats, d: Floats) -> tuple[Floats, Ints, Bools]:
         """First face along rays: (t, number among those of all fields, whether it was met from the front)."""
         t, face = self.cast(f, x, d)
-        number = np.where(face < 0, NOWHERE, face + self.scene.face_start[f])
-        front = np.einsum("ij,ij->i", self.scene.facing[np.maximum(number, 0)], d) < 0 if len(x) else face < 0
-        return t, number, (number != NOWHERE) & front
+        number, front = np.full(len(x), NOWHERE), np.zeros(len(x), bool)
+        hit = np.flatnonzero(face >= 0)
+        number[hit] = face[hit] + self.scene.face_start[f]
+        front[hit] = np.einsum("ij,ij->i", self.scene.facing[number[hit]], d[hit]) < 0
+        return t, number, front
 
     def meet(
         self, f: int, level: Floats, x: Floats, normal: Floats, d: Floats, own: Bools, face: Ints
@@ -85,25 +88,33 @@ class Casting:
     def normal(self, f: int, what: Ints, face: Ints, x: Floats, d: Floats) -> Floats:
         """The gradient normal; that of the face on a cap, or if there is none."""
         smooth = gradient_normal(self.scene, f, x)
-        return np.where(((what == CAP) | ~smooth.any(axis=1))[:, None], self.scene.facing[face], smooth)
+        geometric = np.flatnonzero((what == CAP) | ~smooth.any(axis=1))
+        smooth[geometric] = self.scene.facing[face[geometric]]
+        return smooth
 
     def begin(self, own: Ints, x: Floats, normal: Floats) -> tuple[Floats, Ints]:
-        """Along the normal onto the mesh, within a cell: see `kernels.settle`."""
+        """Along the normal onto the mesh, or along that of the cell: see `kernels.settle`."""
         x, face = x.copy(), np.full(len(x), NOWHERE)
         for f in range(len(self.scene.start)):
-            ask = np.flatnonzero((own == f) & normal.any(axis=1))
-            found, shift = np.full(len(ask), np.inf), np.zeros(len(ask))
-            face[own == f] = LOST
-            near = 2.0 * self.scene.off[f]
-            for along in (-1.0, 1.0):
-                d = along * normal[ask]
-                t, met, front = self.first(f, x[ask] - near * d, d)
-                away = np.abs(t - near) + np.where(front == (along < 0), 0.0, self.scene.reach[f])
-                nearer = (t < near + self.scene.reach[f]) & (away < found)
-                found[nearer], shift[nearer] = away[nearer], along * (t - near)[nearer]
-                face[ask[nearer]] = met[nearer]
-            x[ask] += shift[:, None] * normal[ask]
+            mine = np.flatnonzero(own == f)
+            face[mine] = LOST
+            for along in (normal[mine], cell_normal(self.scene, f, x[mine])):
+                ask = (face[mine] == LOST) & along.any(axis=1)
+                x[mine[ask]], face[mine[ask]] = self.settle(f, x[mine[ask]], along[ask])
         return x, face
+
+    def settle(self, f: int, x: Floats, normal: Floats) -> tuple[Floats, Ints]:
+        """Onto a front against the normal, or a back along it, within a cell, no cap: see `kernels.settle_along`."""
+        reach = 1.0 / (np.abs(normal) / self.scene.spacing[f]).max(axis=1, initial=0.0)
+        found, shift, face = np.full(len(x), np.inf), np.zeros(len(x)), np.full(len(x), LOST)
+        near = 2.0 * self.scene.off[f]
+        for along in (-1.0, 1.0):
+            t, met, front = self.first(f, x - along * near * normal, along * normal)
+            away = np.abs(t - near)
+            good = (met != NOWHERE) & (front == (along < 0)) & (t < near + reach) & (away < found)
+            good[good] = ~self.scene.cap[met[good]]
+            found[good], shift[good], face[good] = away[good], along * (t - near)[good], met[good]
+        return x + shift[:, None] * normal, face
 
     def inside(self, f: int, level: Floats, x: Floats, normal: Floats) -> Bools:
         """Whether a ray from beside the point along the normal sees a back."""

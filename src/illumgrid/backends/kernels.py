@@ -397,6 +397,22 @@ def outward(gx, gy, gz):
 
 
 @jit
+def cell_normal(scene, f, ux, uy, uz):
+    """Outward normal at index u of the trilinear cell of field f that holds it."""
+    last_x, last_y, last_z = scene.shape[f, 0] - 1, scene.shape[f, 1] - 1, scene.shape[f, 2] - 1
+    cx, cy = follow(ux, 0.0, 0.0, 0, last_x - 1), follow(uy, 0.0, 0.0, 0, last_y - 1)
+    cz = follow(uz, 0.0, 0.0, 0, last_z - 1)
+    wx, wy, wz = min(max(ux - cx, 0.0), 1.0), min(max(uy - cy, 0.0), 1.0), min(max(uz - cz, 0.0), 1.0)
+    step_y = scene.shape[f, 2]
+    step_x = step_y * scene.shape[f, 1]
+    here = scene.start[f] + cx * step_x + cy * step_y + cz
+    _, gx, _, _ = cubic(scene.values, here, step_x, step_y, 0.0, wx, wy, wz, 1.0, 0.0, 0.0)
+    _, gy, _, _ = cubic(scene.values, here, step_x, step_y, 0.0, wx, wy, wz, 0.0, 1.0, 0.0)
+    _, gz, _, _ = cubic(scene.values, here, step_x, step_y, 0.0, wx, wy, wz, 0.0, 0.0, 1.0)
+    return outward(gx / scene.spacing[f, 0], gy / scene.spacing[f, 1], gz / scene.spacing[f, 2])
+
+
+@jit
 def gradient_normal(scene, f, ux, uy, uz):
     """Outward normal at index u of field f: central differences (one-sided at the border), interpolated trilinearly.
 
@@ -420,13 +436,9 @@ def gradient_normal(scene, f, ux, uy, uz):
         gy += weight * (np.float64(v[here + after * step_y]) - v[here - before * step_y]) / (after + before)
         after, before = int(cz + k < last_z), int(cz + k > 0)
         gz += weight * (np.float64(v[here + after]) - v[here - before]) / (after + before)
-    sx, sy, sz = scene.spacing[f, 0], scene.spacing[f, 1], scene.spacing[f, 2]
     if gx == 0.0 and gy == 0.0 and gz == 0.0:
-        here = start + cx * step_x + cy * step_y + cz
-        _, gx, _, _ = cubic(v, here, step_x, step_y, 0.0, wx, wy, wz, 1.0, 0.0, 0.0)
-        _, gy, _, _ = cubic(v, here, step_x, step_y, 0.0, wx, wy, wz, 0.0, 1.0, 0.0)
-        _, gz, _, _ = cubic(v, here, step_x, step_y, 0.0, wx, wy, wz, 0.0, 0.0, 1.0)
-    return outward(gx / sx, gy / sy, gz / sz)
+        return cell_normal(scene, f, ux, uy, uz)
+    return outward(gx / scene.spacing[f, 0], gy / scene.spacing[f, 1], gz / scene.spacing[f, 2])
 
 
 @jit
@@ -530,24 +542,42 @@ def stay(scene, own, x, n):
 
 
 @jit
-def settle(scene, own, x, n):
-    """Move a query along its normal onto its own mesh, which lies a little beside the trilinear set: (position, face).
+def settle_along(scene, own, x, n):
+    """Move the frame point x along n onto mesh `own`: (position, face).
 
-    Against the normal there should be a front, or along it a back: the nearer one within a cell. Where the two normals
-    disagree so much that there is neither, any face will do.
+    Against n there must be a front, or along it a back: the nearer one within a cell, no cap. So nothing lies between.
     """
-    if own >= scene.start.shape[0]:
-        return x, NOWHERE
-    found, shift, face, near, reach = np.inf, 0.0, LOST, 2.0 * scene.off[own], scene.reach[own]
+    pace = max(
+        abs(n[0]) / scene.spacing[own, 0], abs(n[1]) / scene.spacing[own, 1], abs(n[2]) / scene.spacing[own, 2]
+    )  # cells along the axis on which it gains most
+    found, shift, face, near = np.inf, 0.0, LOST, 2.0 * scene.off[own]
     for k in range(2):
         along = 2.0 * k - 1.0
         d = (along * n[0], along * n[1], along * n[2])
         start = (x[0] - near * d[0], x[1] - near * d[1], x[2] - near * d[2])
-        t, met, front = cast_from(scene, own, start, d, near + reach)
-        away = abs(t - near) + (0.0 if front == (k == 0) else reach)
-        if away < found:
-            found, shift, face = away, along * (t - near), met
+        t, met, front = cast_from(scene, own, start, d, near + 1.0 / pace)
+        if met != NOWHERE and front == (k == 0) and not scene.cap[met] and abs(t - near) < found:
+            found, shift, face = abs(t - near), along * (t - near), met
     return (x[0] + shift * n[0], x[1] + shift * n[1], x[2] + shift * n[2]), face
+
+
+@jit
+def settle(scene, own, x, n):
+    """Move a query onto its own mesh, which lies a little beside the trilinear set: (position, face).
+
+    Along its normal, or where noise turns that aside, along the normal of its cell; LOST if neither leads there.
+    """
+    if own >= scene.start.shape[0]:
+        return x, NOWHERE
+    at, face = settle_along(scene, own, x, n)
+    if face == LOST:
+        ux = (x[0] - scene.origin[own, 0]) / scene.spacing[own, 0]
+        uy = (x[1] - scene.origin[own, 1]) / scene.spacing[own, 1]
+        uz = (x[2] - scene.origin[own, 2]) / scene.spacing[own, 2]
+        steep = cell_normal(scene, own, ux, uy, uz)
+        if steep[0] != 0.0 or steep[1] != 0.0 or steep[2] != 0.0:
+            at, face = settle_along(scene, own, x, steep)
+    return at, face
 
 
 begin = either(stay, settle)

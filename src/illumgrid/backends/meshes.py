@@ -125,7 +125,6 @@ Meshed = namedtuple(  # type: ignore[misc]
         "cap",  # (m,) bool
         "face_start",  # (F,) int64: number of the first face of each
         "off",  # (F,) how far rays start off a face
-        "reach",  # (F,) how far a query may lie from its mesh: a cell
         "stack",  # (...) int32: room for the traversal, one for each thread
     ),
 )
@@ -149,6 +148,5 @@ def meshed(scene: Scene, row: Floats) -> Any:
         cap=np.concatenate([mesh.cap for mesh in meshes]),
         face_start=np.cumsum([0, *(len(mesh.faces) for mesh in meshes)], dtype=np.int64)[:-1],
         off=OFF / scale,
-        reach=np.linalg.norm(fields.spacing, axis=1),
         stack=bvh.stack_for(*trees),
     )

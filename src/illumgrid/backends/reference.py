@@ -218,10 +218,21 @@ def gradient_normal(scene: Marchable, f: int, x: Floats) -> Floats:
             rise = v[tuple(after.T)].astype(float) - v[tuple(before.T)]
             gradient[:, axis] += weight * rise / (after - before)[:, axis]
     flat = ~gradient.any(axis=1)
-    for axis in range(3):
-        step = np.tile(np.eye(3)[axis], (int(flat.sum()), 1))
-        gradient[flat, axis] = cubic(v, np.zeros(len(step)), cell[flat], e[flat], step)[:, 1]
-    gradient /= scene.spacing[f]
+    return np.where(flat[:, None], cell_normal(scene, f, x), outward(gradient / scene.spacing[f]))
+
+
+def cell_normal(scene: Marchable, f: int, x: Floats) -> Floats:
+    """Outward unit normals (n, 3) of the trilinear cells that hold frame points."""
+    v, last = voxels(scene, f), scene.shape[f] - 1
+    u = (x - scene.origin[f]) / scene.spacing[f]
+    cell = np.clip(np.floor(u), 0, last - 1).astype(np.int64)
+    steps = (np.tile(step, (len(x), 1)) for step in np.eye(3))
+    slopes = [cubic(v, np.zeros(len(x)), cell, np.clip(u - cell, 0.0, 1.0), step)[:, 1] for step in steps]
+    return outward(np.stack(slopes, axis=1) / scene.spacing[f])
+
+
+def outward(gradient: Floats) -> Floats:
+    """Unit vectors (n, 3) against gradients; 0 where they are 0. Scaled first: a tiny slope's square underflows."""
     largest = np.abs(gradient).max(axis=1, keepdims=True, initial=0.0)
     gradient = gradient / np.where(largest > 0, largest, 1.0)
     length = np.linalg.norm(gradient, axis=1, keepdims=True)
