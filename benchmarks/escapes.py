@@ -87,7 +87,8 @@ def main():
             count = -(-asked.paths // (len(cases) * len(queries)))
             answer = backend.solve(scene, queries, paths=range(count), bounces=BOUNCES, seed=4)
             leaks = round(float((answer.mean[:, 0].astype(float) * answer.paths).sum() / np.pi))
-            total, escaped, lost = total + int(answer.paths.sum()), escaped + leaks, lost + int((answer.paths == 0).sum())
+            total, escaped = total + int(answer.paths.sum()), escaped + leaks
+            lost += int((answer.paths == 0).sum())
             if leaks:
                 print(f"  {name}: {leaks} escape from {case}", flush=True)
         print(f"{name}: {escaped} of {total} paths escape ({lost} queries are holes; "

@@ -66,7 +66,8 @@ def line(row: Row) -> str:
 
 def contenders() -> dict[str, Backend]:
     """The backends that work on this machine, by the names of the table; numba with both of its surfaces."""
-    known = {"numba:levelset": {"surface": "levelset"}, "numba:mesh": {"surface": "mesh"}, "embree": {}, "reference": {}}
+    known: dict[str, dict[str, str]] = {f"numba:{surface}": {"surface": surface} for surface in ("levelset", "mesh")}
+    known |= {"embree": {}, "reference": {}}
     found = {}
     for title, options in known.items():
         try:

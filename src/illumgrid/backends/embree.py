@@ -37,7 +37,7 @@ from illumgrid.stages import Backend, hookimpl
 from illumgrid.volume import Floats
 
 Cast = Callable[[int, Floats, Floats], tuple[Floats, Ints]]
-"""First face of field f's mesh along frame rays (n, 3): distance (n,) and number (n,) in that mesh, inf and -1 if none."""
+"""First face of field f's mesh along frame rays (n, 3): distance and number in that mesh, each (n,); inf, -1 if none."""
 
 
 @dataclass(frozen=True)
@@ -119,7 +119,7 @@ class Casting:
     def inside(self, f: int, level: Floats, x: Floats, normal: Floats) -> Bools:
         """Whether a ray from beside the point along the normal sees a back."""
         _, met, front = self.first(f, x + self.scene.off[f] * normal, normal)
-        return (met != NOWHERE) & ~front
+        return np.asarray((met != NOWHERE) & ~front)
 
 
 def near_enough(x: Floats, d: Floats) -> Floats:
@@ -155,14 +155,15 @@ def by_embree(scene: Any, meshes: list[LevelMesh]) -> Cast:
     built = [embree_scene(mesh) if len(mesh.faces) else None for mesh in meshes]
 
     def cast(f: int, x: Floats, d: Floats) -> tuple[Floats, Ints]:
-        if built[f] is None or not len(x):
+        tree = built[f]
+        if tree is None or not len(x):
             return np.full(len(x), np.inf), np.full(len(x), -1)
         x, d = (x - scene.centre[f]) * scene.scale[f], d * scene.scale[f]
         start = near_enough(x, d)
         come = np.isfinite(start)
         t, face = np.full(len(x), np.inf), np.full(len(x), -1)
         origin = (x[come] + start[come, None] * d[come]).astype(np.float32)
-        hit = built[f].run(origin, d[come].astype(np.float32), output=1)
+        hit = tree.run(origin, d[come].astype(np.float32), output=1)
         face[come] = hit["primID"]
         t[come] = np.where(hit["primID"] < 0, np.inf, hit["tfar"].astype(float) + start[come])
         return t, face

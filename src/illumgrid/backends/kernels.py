@@ -1,8 +1,8 @@
 """The compiled call tree: marching rays through trilinear fields, casting them at meshes, and walking light paths.
 
 It lives in this one file, with `bvh` and `lanes` below it, because Numba's disk cache does not see edits elsewhere
-(`lanes.cached` names the two); what else it imports is frozen. Kernels are serial, release the GIL and depend on nothing
-but their arguments; threads are the caller's business.
+(`lanes.cached` names the two); what else it imports is frozen. Kernels are serial, release the GIL and depend on
+nothing but their arguments; threads are the caller's business.
 
 Two surfaces stand for a level set. A scene that is `illumgrid.levelset.Marchable` is marched; one that is
 `illumgrid.backends.meshes.Meshed` has a closed mesh for each field. The path loop is the same: the four questions that
@@ -340,8 +340,8 @@ def cast_from(scene, f, x, d, limit):
 def mesh_from(scene, f, level, x, n, d, own, face, limit):
     """First meeting of the frame ray x + t d with field f's mesh, t < limit: (t, what, face).
 
-    It starts on a surface of normal n, and if `own` on this mesh, on `face`. If it goes under that face it has met it at
-    once; else it starts off by what rounding may do. If it meets a back after that, it went under a neighbour.
+    It starts on a surface of normal n, and if `own` on this mesh, on `face`. If it goes under that face it has met it
+    at once; else it starts off by what rounding may do. If it meets a back after that, it went under a neighbour.
     """
     off = scene.off[f]
     if own:
@@ -368,8 +368,8 @@ def nearest_hit(scene, level, x, n, d, on, on_face):
 
     The ray starts on a surface of normal n, 0 if on none.
 
-    `face` is the axis of a cap, or of a mesh the face; `on_face` is that of the start. Fields count from 0, quads follow.
-    A quad cannot be met again; the level set itself can.
+    `face` is the axis of a cap, or of a mesh the face; `on_face` is that of the start. Fields count from 0, quads
+    follow. A quad cannot be met again; the level set itself can.
     """
     fields = scene.start.shape[0]
     best, number, what, face = np.inf, -1, MISS, NOWHERE
@@ -458,7 +458,7 @@ def normal_by_field(scene, f, what, face, x, d):
 
 @jit
 def normal_on_mesh(scene, f, what, face, x, d):
-    """Normal where a ray met the mesh of field f at x: the gradient normal; that of the face on a cap, or if there is none."""
+    """Normal where a ray met the mesh of field f at x: the gradient normal; of the face on a cap, or if there is none."""
     n = normal_by_field(scene, f, SURFACE, NOWHERE, x, d)
     if what == CAP or (n[0] == 0.0 and n[1] == 0.0 and n[2] == 0.0):
         facing = scene.facing[face]
@@ -516,7 +516,7 @@ def in_solid(scene, f, level, x, n):
 
 @jit
 def in_mesh(scene, f, level, x, n):
-    """Whether the frame point x lies inside the mesh of field f, or on it: whether a ray from beside x along n sees a back."""
+    """Whether the frame point x lies inside the mesh of field f, or on it: a ray from beside x along n sees a back."""
     off = scene.off[f]
     x = (x[0] + off * n[0], x[1] + off * n[1], x[2] + off * n[2])
     _, face, front = cast_from(scene, f, x, n, np.inf)
@@ -529,7 +529,7 @@ inside = either(in_solid, in_mesh)
 @jit
 def buried(scene, level, x, n, own):
     """Whether the frame point x, on a surface of normal n, lies inside the solid of a field other than `own`."""
-    for f in range(scene.start.shape[0]):
+    for f in range(scene.start.shape[0]):  # noqa: SIM110
         if f != own and inside(scene, f, level[f], x, n):
             return True
     return False
@@ -628,7 +628,7 @@ def light_from_lamps(scene, choice, u, v, level, on, on_face, x, n):
 
 @jit
 def walk(scene, key, path, bounces, level, own, own_face, x, n):
-    """Worth (red, green, blue) of one path from the frame point x, with normal n, on surface `own`, on `own_face` of it.
+    """Worth (red, green, blue) of one path from the frame point x, with normal n, on surface `own`, there `own_face`.
 
     The irradiance there is π times the mean over the paths.
     """

@@ -1,6 +1,6 @@
 """The same paths in pure NumPy, written to be read: all rays of a batch take each step together.
 
-The path loop has the headings of `kernels.walk`; everything that Numba's kernels do for speed is left out. What the rays
+The path loop has the headings of `kernels.walk`; everything that Numba's kernels do for speed is left out. What rays
 meet is handed in: the trilinear level set here, its mesh in `embree`.
 """
 
@@ -188,7 +188,7 @@ def meet_quad(scene: Marchable, q: int, x: Floats, d: Floats) -> Floats:
 def nearest_hit(
     surfaces: Surfaces, level: Floats, x: Floats, normal: Floats, d: Floats, on: Ints, on_face: Ints
 ) -> tuple[Floats, Ints, Ints, Ints]:
-    """First surface along frame rays from surfaces with these normals: (t, number, what, face), each (n,); fields come first, then quads."""
+    """First surface along frame rays, which start on these normals: (t, number, what, face); fields first, then quads."""
     scene, n = surfaces.scene, len(x)
     best, number, what, face = np.full(n, np.inf), np.full(n, -1), np.full(n, MISS), np.full(n, NOWHERE)
     for q in range(len(scene.quad_corner)):
