@@ -126,8 +126,8 @@ def bumps(n):
 
 
 def test_mesh_and_level_set_differ_like_the_square_of_the_spacing():
-    # The same random numbers: a path takes another turn where it dips under one surface and not under the other. Normals
-    # of cells and of facets are off by an angle δ = O(spacing), and (1 - cos δ)/2 of the directions dip: O(spacing²).
+    # The same random numbers: a path takes another turn where it dips under one surface and not under the other.
+    # Normals of cells and of facets are off by δ = O(spacing), and (1 - cos δ)/2 of the directions dip: O(spacing²).
     where = isosurface(bumps(41), 0.13).vertices
     where = where[np.random.default_rng(0).permutation(len(where))[:1500]]
     turned = []

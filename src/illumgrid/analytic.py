@@ -120,7 +120,7 @@ def _asked(scene: Scene, on_voxels: bool) -> Queries:
     if on_voxels:
         return Queries.at(scene, index_to_world(volume, np.argwhere(np.abs(volume.values - 0.5) < 0.25)))
     queries = join_queries(list(on_level_sets(scene, [0.41, 0.5, 0.59], 0, points=60)))
-    return queries[queries.normal.any(axis=1)]
+    return queries[np.flatnonzero(queries.normal.any(axis=1))]
 
 
 def furnace(on_voxels: bool = False) -> Case:

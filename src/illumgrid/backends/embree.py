@@ -37,7 +37,7 @@ from illumgrid.stages import Backend, hookimpl
 from illumgrid.volume import Floats
 
 Cast = Callable[[int, Floats, Floats], tuple[Floats, Ints]]
-"""First face of field f's mesh along frame rays (n, 3): distance and number in that mesh, each (n,); inf, -1 if none."""
+"""First face of field f's mesh along frame rays (n, 3): distance and number in that mesh, each (n,); inf, -1: none."""
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,8 @@ A field comes as {v >= level}: `Marchable` has turned it so. Index coordinates o
 spacing[f] for x in the frame of the scene; t is world distance throughout.
 """
 
+from typing import Any
+
 import numpy as np
 from numba.extending import overload, register_jitable
 
@@ -36,13 +38,13 @@ ON_A_WALL = 1e-10  # a wall reaches this share of its size farther, so that wall
 NOWHERE, LOST = -1, -2  # instead of a face: a surface that needs none; a query whose mesh is out of reach
 
 
-def either(marched, meshed):
+def either(marched: Any, meshed: Any) -> Any:
     """One function for both surfaces: chosen by the type of the scene as it is compiled, or called as plain Python."""
 
     def ask(scene, *rest):
         return (marched if isinstance(scene, Marchable) else meshed)(scene, *rest)
 
-    @overload(ask, jit_options={"nogil": True, "error_model": "numpy", "_nrt": False})
+    @overload(ask, jit_options={"nogil": True, "error_model": "numpy", "_nrt": False})  # type: ignore[typeddict-unknown-key]
     def _(scene, *rest):
         chosen = marched if scene.instance_class is Marchable else meshed
         return lambda scene, *rest: chosen(scene, *rest)
@@ -458,7 +460,7 @@ def normal_by_field(scene, f, what, face, x, d):
 
 @jit
 def normal_on_mesh(scene, f, what, face, x, d):
-    """Normal where a ray met the mesh of field f at x: the gradient normal; of the face on a cap, or if there is none."""
+    """Normal where a ray met mesh f at x: the gradient normal; that of the face on a cap, or where there is none."""
     n = normal_by_field(scene, f, SURFACE, NOWHERE, x, d)
     if what == CAP or (n[0] == 0.0 and n[1] == 0.0 and n[2] == 0.0):
         facing = scene.facing[face]
@@ -628,7 +630,7 @@ def light_from_lamps(scene, choice, u, v, level, on, on_face, x, n):
 
 @jit
 def walk(scene, key, path, bounces, level, own, own_face, x, n):
-    """Worth (red, green, blue) of one path from the frame point x, with normal n, on surface `own`, there `own_face`.
+    """Worth (red, green, blue) of one path from the frame point x, with normal n, on `own_face` of surface `own`.
 
     The irradiance there is π times the mean over the paths.
     """

@@ -113,7 +113,7 @@ def row_groups(scene: Scene, level: Floats) -> Iterator[tuple[Floats, NDArray[np
         yield limits[:, 0] + row * step, members
 
 
-Meshed = namedtuple(  # type: ignore[misc]
+Meshed: Any = namedtuple(  # type: ignore[misc]
     "Meshed",
     (
         *Marchable._fields,

@@ -188,7 +188,7 @@ def meet_quad(scene: Marchable, q: int, x: Floats, d: Floats) -> Floats:
 def nearest_hit(
     surfaces: Surfaces, level: Floats, x: Floats, normal: Floats, d: Floats, on: Ints, on_face: Ints
 ) -> tuple[Floats, Ints, Ints, Ints]:
-    """First surface along frame rays, which start on these normals: (t, number, what, face); fields first, then quads."""
+    """First surface along frame rays, which start on these normals: (t, number, what, face); fields come first."""
     scene, n = surfaces.scene, len(x)
     best, number, what, face = np.full(n, np.inf), np.full(n, -1), np.full(n, MISS), np.full(n, NOWHERE)
     for q in range(len(scene.quad_corner)):
@@ -217,8 +217,8 @@ def gradient_normal(scene: Marchable, f: int, x: Floats) -> Floats:
             before[:, axis] = np.maximum(before[:, axis] - 1, 0)
             rise = v[tuple(after.T)].astype(float) - v[tuple(before.T)]
             gradient[:, axis] += weight * rise / (after - before)[:, axis]
-    flat = ~gradient.any(axis=1)
-    return np.where(flat[:, None], cell_normal(scene, f, x), outward(gradient / scene.spacing[f]))
+    known = gradient.any(axis=1, keepdims=True)
+    return np.where(known, outward(gradient / scene.spacing[f]), cell_normal(scene, f, x))
 
 
 def cell_normal(scene: Marchable, f: int, x: Floats) -> Floats:
