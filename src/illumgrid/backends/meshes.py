@@ -113,7 +113,7 @@ def row_groups(scene: Scene, level: Floats) -> Iterator[tuple[Floats, NDArray[np
         yield limits[:, 0] + row * step, members
 
 
-Meshed: Any = namedtuple(  # type: ignore[misc]
+Meshed = namedtuple(  # type: ignore[misc]
     "Meshed",
     (
         *Marchable._fields,
@@ -138,7 +138,8 @@ def meshed(scene: Scene, row: Floats) -> Any:
     trees = [mesh.tree for mesh in meshes]
     memory = [tree.memory for tree in trees]
     scale = np.array([tree.scale for tree in trees])
-    return Meshed(
+    layout: Any = Meshed
+    return layout(
         *fields,
         memory=memory[0] if len(trees) == 1 else np.concatenate(memory),
         tree_start=np.cumsum([0, *(len(m) for m in memory)], dtype=np.int64)[:-1],
