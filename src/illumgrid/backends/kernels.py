@@ -711,7 +711,8 @@ def mean_worth(scene, key, first, count, bounces, level, own, face, x, n):
             if size == 1:
                 other_r, other_g, other_b = lone_r, lone_g, lone_b
             else:
-                other_r, other_g, other_b = walk(scene, key, np.uint64(at + (i ^ mate)), bounces, level, own, face, x, n)
+                mate_path = np.uint64(at + (i ^ mate))
+                other_r, other_g, other_b = walk(scene, key, mate_path, bounces, level, own, face, x, n)
                 sum_r, sum_g, sum_b = sum_r + other_r, sum_g + other_g, sum_b + other_b
             off_r += (red - other_r) ** 2
             off_g += (green - other_g) ** 2
