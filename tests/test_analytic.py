@@ -19,14 +19,11 @@ def cases():
     return [make() for make in analytic.CASES]
 
 
-def test_numba_agrees_with_every_closed_form(cases):
-    rows = list(check(["numba"], paths=1 << 20, seed=1, cases=cases))
-    assert len(rows) == len(cases)
-    assert all(row.agrees for row in rows), "\n".join(map(verify.line, rows))
-
-
-def test_reference_agrees_with_every_closed_form(cases):
-    rows = list(check(["reference"], seed=2, cases=cases))
+@pytest.mark.parametrize("name", verify.contenders())
+def test_a_backend_agrees_with_every_closed_form(name, cases):
+    paths = {"embree": 1 << 18, "reference": 1 << 18}.get(name, 1 << 20)
+    rows = list(check([name], paths=paths, seed=1, cases=cases))
+    assert len(rows) == sum(not case.voxels or name in ("numba:levelset", "reference") for case in cases)
     assert all(row.agrees for row in rows), "\n".join(map(verify.line, rows))
 
 
@@ -39,7 +36,8 @@ class Broken:
     """`numba` with a mistake."""
 
     mistake: str
-    geometry = "levelset"
+    surface: str = "levelset"
+    geometry = "both"
 
     @property
     def name(self):
@@ -62,7 +60,7 @@ class Broken:
                 for kind in ("fields", "quads")
             }
             scene = replace(scene, **parts)
-        answer = Numba().solve(scene, asked, **how)
+        answer = Numba(surface=self.surface).solve(scene, asked, **how)
         if self.mistake == "holes":
             rows = np.arange(len(queries)) % 7 == 0
             empty = np.where(rows[:, None], 0, answer.mean), np.where(rows[:, None], 0, answer.m2)
@@ -87,9 +85,10 @@ FINDS = {
 }
 
 
+@pytest.mark.parametrize("surface", ["levelset", "mesh"])
 @pytest.mark.parametrize("mistake", FINDS)
-def test_a_mistake_is_found_at_the_default_number_of_paths(mistake, cases):
-    rows = list(check([Broken(mistake)], cases=[case for case in cases if case.name in FINDS[mistake]]))
+def test_a_mistake_is_found_at_the_default_number_of_paths(mistake, surface, cases):
+    rows = list(check([Broken(mistake, surface)], cases=[case for case in cases if case.name in FINDS[mistake]]))
     assert [row.scene for row in rows if not row.agrees] == FINDS[mistake], "\n".join(map(verify.line, rows))
     assert all("DISAGREES" in verify.line(row) for row in rows)
 
@@ -154,9 +153,7 @@ def test_no_path_is_bad_input():
         next(check(["numba"], paths=0))
 
 
-def test_what_is_not_installed_is_left_out(monkeypatch):
-    assert {"numba", "reference"} <= set(verify.available())
-
+def test_what_is_not_installed_is_left_out_and_one_name_is_both_surfaces(monkeypatch):
     def missing(name, **options):
         if name == "embree":
             raise BadInput("embreex is not installed")
@@ -164,7 +161,15 @@ def test_what_is_not_installed_is_left_out(monkeypatch):
 
     known = registry.backend
     monkeypatch.setattr(registry, "backend", missing)
-    assert verify.available() == ["numba", "reference"]
+    assert list(verify.contenders()) == ["numba:levelset", "numba:mesh", "reference"]
+    rows = check(["numba"], paths=500, cases=[analytic.plane(), analytic.cavity(on_voxels=True)])
+    assert [(row.backend, row.scene) for row in rows] == [
+        ("numba:levelset", "linear field, unit sky"),
+        ("numba:levelset", "sealed furnace, voxels"),
+        ("numba:mesh", "linear field, unit sky"),
+    ]
+    with pytest.raises(BadInput, match="not installed"):
+        next(check(["embree"]))
 
 
 def command(*arguments):
@@ -173,7 +178,7 @@ def command(*arguments):
 
 def test_the_command_prints_a_table(capsys, monkeypatch):
     monkeypatch.setattr(verify, "CASES", (analytic.plane, analytic.shadow))
-    assert command("--backend", "numba", "--paths", "5000") == 0
+    assert command("--backend", "numba:mesh", "--paths", "5000") == 0
     said = capsys.readouterr().out.splitlines()
     assert said[0].split() == ["scene", "backend", "expected", "measured", "z", "max", "|z|", "verdict"]
     assert "E = π" in said[1] and "agrees" in said[1]
@@ -182,7 +187,7 @@ def test_the_command_prints_a_table(capsys, monkeypatch):
 
 def test_the_command_exits_with_1_if_a_backend_disagrees(capsys, monkeypatch):
     monkeypatch.setattr(verify, "CASES", (analytic.plane,))
-    monkeypatch.setattr(registry, "backend", lambda name: Broken("normals"))
+    monkeypatch.setattr(registry, "backend", lambda name, **options: Broken("normals"))
     assert command("--backend", "broken") == 1
     assert "DISAGREES" in capsys.readouterr().out
     monkeypatch.undo()

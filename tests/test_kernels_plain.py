@@ -148,9 +148,12 @@ def test_normals_and_solids_are_those_of_the_volume(inside):
     solid = upward(scene)[0] * (interpolate(volume, index) - 4.5) >= 0
     for u, normal, within in zip(index, expected, solid):
         np.testing.assert_allclose(kernels.gradient_normal(fields, 0, *u), normal, atol=1e-6)
-        assert kernels.holds(fields, 0, level, *u) == within
+        assert kernels.in_solid(fields, 0, level, tuple(u * volume.spacing), tuple(normal)) == within
     assert (~expected.any(axis=1)).any()
-    assert not any(kernels.holds(fields, 0, level, *np.array(u)) for u in ([-0.1, 1, 1], [1, 4.1, 1], [1, 1, 2.1]))
+    assert not any(
+        kernels.in_solid(fields, 0, level, tuple(np.array(u) * volume.spacing), (0.0, 0.0, 1.0))
+        for u in ([-0.1, 1, 1], [1, 4.1, 1], [1, 1, 2.1])
+    )
 
 
 def test_directions_have_the_moments_of_a_cosine():
@@ -242,7 +245,8 @@ def test_a_path_that_starts_inside_another_solid_is_worth_nothing():
     point, normal = (2.5, 3.0, 2.0), (-1.0, 0.0, 0.0)
     for path in range(5):
         key = np.uint64(7)
-        assert kernels.walk(marchable(scene), key, np.uint64(path), 4, levels, 0, point, normal) == (0, 0, 0)
+        start = (levels, 0, kernels.NOWHERE, point, normal)
+        assert kernels.walk(marchable(scene), key, np.uint64(path), 4, *start) == (0, 0, 0)
 
 
 @pytest.mark.parametrize("d", [(1, 1, 1), (-1, 1, -1), (0, 0, 1), (0, -1, 0)])

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from illumgrid.samples import Queries, join_queries
 from illumgrid.scene import Field, Material, Quad, Scene, box_around, upright
+from illumgrid.stages import on_level_sets
 from illumgrid.volume import Floats, Volume, index_to_world
 
 _TURN = np.array([[2.0, -1.0, 2.0], [2.0, 2.0, -1.0], [-1.0, 2.0, 2.0]]) / 3  # no axis of the array is one of the world
@@ -37,6 +38,9 @@ class Case:
         points of one cell of a surface, each of which stands for half of it.
     kept : (n, 3) float64, optional
         Albedo where each query lies; without it the sum is that of area · E.
+    voxels : bool
+        The queries lie on voxels, each on the level set through itself. Of such a level set there may be no mesh (at a
+        peak it is a point): a question for those who march.
     """
 
     name: str
@@ -48,6 +52,7 @@ class Case:
     reason: str
     area: Floats | None = None
     kept: Floats | None = None
+    voxels: bool = False
 
 
 def _case(
@@ -109,24 +114,35 @@ def _dips() -> float:
     return float(0.5 * (1 - np.sqrt(1 - sine**2)))
 
 
-def furnace() -> Case:
+def _asked(scene: Scene, on_voxels: bool) -> Queries:
+    """Queries on the voxels of field 0 in the middle of its values, or uniform by area on three of its level sets."""
+    volume = scene.fields[0].volume
+    if on_voxels:
+        return Queries.at(scene, index_to_world(volume, np.argwhere(np.abs(volume.values - 0.5) < 0.25)))
+    queries = join_queries(list(on_level_sets(scene, [0.41, 0.5, 0.59], 0, points=60)))
+    return queries[np.flatnonzero(queries.normal.any(axis=1))]
+
+
+def furnace(on_voxels: bool = False) -> Case:
     """White furnace: E = π(1 - a^(B+1)) to π, for any geometry.
 
     Radiance 1 comes from everywhere: sky 1, surfaces of albedo a and emission 1 - a. A path that escapes is worth
     Σ a^k (1 - a) + a^n = 1, one cut off after B reflections 1 - a^(B+1); so E lies between, and the bound is what is
-    between: π a^(B+1). The field is noise, asked at its voxels, over a floor that paths see from its front only.
+    between: π a^(B+1). The field is noise, over a floor that paths see from its front only.
     """
     albedo, bounces = np.array([0.5, 0.4, 0.2]), 21
     place = {"spacing": np.array([1.0, 0.7, 1.9]), "direction": _TURN * [1, 1, -1]}
     field = _field("noise", np.random.default_rng(3).random((6, 5, 6)), (0.3, 0.7), albedo, True, **place)
     floor = replace(Scene.floor(field.volume).quads[0], material=field.material)
     scene = Scene((field,), (floor,), np.ones(3))
-    voxels = index_to_world(field.volume, np.argwhere(np.abs(field.volume.values - 0.5) < 0.25))
-    queries = Queries.at(scene, voxels[(voxels - floor.corner) @ floor.normal > 1e-3])
-    return _case("white furnace, noise", scene, queries, np.pi, bounces, "E = π", np.pi * albedo.max() ** (bounces + 1))
+    queries = _asked(scene, on_voxels)
+    queries = queries[(queries.point - floor.corner) @ floor.normal > 1e-3]
+    bound = np.pi * albedo.max() ** (bounces + 1)
+    case = _case("white furnace, noise", scene, queries, np.pi, bounces, "E = π", bound)
+    return replace(case, name="white furnace, voxels", voxels=True) if on_voxels else case
 
 
-def cavity() -> Case:
+def cavity(on_voxels: bool = False) -> Case:
     """White furnace, sealed: E = π(1 - a^(B+1)) on every path, for any geometry.
 
     A shell of solid voxels shuts noise in; the k-th of B + 1 meetings adds (1 - a) a^k. A leak shows a sky of 1000.
@@ -135,9 +151,19 @@ def cavity() -> Case:
     values = np.pad(np.random.default_rng(4).random((7, 6, 8)), 1, constant_values=9.0)
     field = _field("noise", values, (0.3, 0.7), _GRAY, True, spacing=np.array([1.0, 0.7, 1.9]), direction=_TURN)
     scene = Scene((field,), background=np.full(3, 1e3))
-    queries = Queries.at(scene, index_to_world(field.volume, np.argwhere(np.abs(values - 0.5) < 0.25)))
-    truth = np.pi * (1 - _GRAY ** (bounces + 1))
-    return _case("sealed furnace, noise", scene, queries, truth, bounces, "E = π(1 - a^(B+1))")
+    queries, truth = _asked(scene, on_voxels), np.pi * (1 - _GRAY ** (bounces + 1))
+    case = _case("sealed furnace, noise", scene, queries, truth, bounces, "E = π(1 - a^(B+1))")
+    return replace(case, name="sealed furnace, voxels", voxels=True) if on_voxels else case
+
+
+def furnace_on_voxels() -> Case:
+    """The white furnace asked where eight cells meet, each with its own side."""
+    return furnace(on_voxels=True)
+
+
+def cavity_on_voxels() -> Case:
+    """The sealed furnace asked where eight cells meet, each with its own side."""
+    return cavity(on_voxels=True)
 
 
 def glowing_box() -> Case:
@@ -297,4 +323,17 @@ def balance() -> Case:
     return Case("energy in the box", scene, queries, power[None], bound, 3, reason, area, kept)
 
 
-CASES = (furnace, cavity, glowing_box, plane, convex, luminaire, shadow, half_sky, gray_box, balance)
+CASES = (
+    furnace,
+    furnace_on_voxels,
+    cavity,
+    cavity_on_voxels,
+    glowing_box,
+    plane,
+    convex,
+    luminaire,
+    shadow,
+    half_sky,
+    gray_box,
+    balance,
+)

@@ -52,12 +52,24 @@ def isosurface(volume: Volume, isovalue: float, inside: Side = "above", capped: 
            topological guarantees", J. Graphics Tools 8(2), 2003 (scikit-image's ``marching_cubes``).
     """
     import trimesh
-    from skimage.measure import marching_cubes
 
     if not np.isfinite(isovalue):
         raise BadInput(f"the isovalue is {isovalue}; expected a finite number")
     if inside not in ("above", "below"):
         raise BadInput(f"inside is {inside!r}; expected 'above' or 'below'")
+    index, faces = extract(volume, isovalue, inside, capped)
+    if np.linalg.det(volume.direction) < 0:
+        faces = faces[:, ::-1]
+    return trimesh.Trimesh(index_to_world(volume, index), faces, process=False)
+
+
+def extract(volume: Volume, isovalue: float, inside: Side, capped: bool) -> tuple[Floats, NDArray[np.int64]]:
+    """Vertices (k, 3) in index coordinates and faces (m, 3) of a level set: see `isosurface`.
+
+    Faces are counterclockwise from outside in a right-handed picture of the index axes.
+    """
+    from skimage.measure import marching_cubes
+
     level = off_the_data(volume, isovalue, inside)
     values = volume.values.copy()  # the extraction wants a writeable buffer
     if capped:
@@ -65,7 +77,7 @@ def isosurface(volume: Volume, isovalue: float, inside: Side = "above", capped: 
         beyond = min(values.min(), level) - spread if inside == "above" else max(values.max(), level) + spread
         values = np.pad(values, 1, constant_values=np.float32(beyond))
     if not values.min() < level < values.max():
-        return trimesh.Trimesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64))
+        return np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64)
     # scikit-image adds 2e-16 to every difference: scale by a power of two, or tiny fields are all epsilon.
     exponent = int(np.frexp(float(values.max()) - float(values.min()))[1])
     # It winds faces by the left hand: "ascent" turns them, by the right hand, away from what is higher.
@@ -74,10 +86,7 @@ def isosurface(volume: Volume, isovalue: float, inside: Side = "above", capped: 
         gradient_direction="ascent" if inside == "above" else "descent",
     )  # fmt: skip
     index = index.astype(float) - (1.0 if capped else 0.0)
-    index = np.clip(index, 0.0, np.array(volume.shape) - 1.0)
-    if np.linalg.det(volume.direction) < 0:
-        faces = faces[:, ::-1]
-    return trimesh.Trimesh(index_to_world(volume, index), faces, process=False)
+    return np.clip(index, 0.0, np.array(volume.shape) - 1.0), faces.astype(np.int64)
 
 
 class Marchable(NamedTuple):

@@ -25,6 +25,7 @@ OWN = (
     "samplers.uniform",
     "samplers.adaptive",
     "backends.numba_",
+    "backends.embree",
     "backends.reference",
     "interpolators.nearest",
     "interpolators.splat",

@@ -1,16 +1,26 @@
-"""The compiled call tree: marching rays through trilinear fields, and walking light paths.
+"""The compiled call tree: marching rays through trilinear fields, casting them at meshes, and walking light paths.
 
-All of it lives in this one file because Numba's disk cache does not see edits elsewhere; its only import is the frozen
-`rng`. Kernels are serial, release the GIL and depend on nothing but their arguments; threads are the caller's business.
+It lives in this one file, with `bvh` and `lanes` below it, because Numba's disk cache does not see edits elsewhere
+(`lanes.cached` names the two); what else it imports is frozen. Kernels are serial, release the GIL and depend on
+nothing but their arguments; threads are the caller's business.
 
-A field comes as {v >= level}: `illumgrid.levelset.Marchable` has turned it so. Index coordinates of field f are
-(x - origin[f]) / spacing[f] for x in the frame of the scene; t is world distance throughout.
+Two surfaces stand for a level set. A scene that is `illumgrid.levelset.Marchable` is marched; one that is
+`illumgrid.backends.meshes.Meshed` has a closed mesh for each field. The path loop is the same: the four questions that
+differ are asked through `either`, and only what a scene's type asks for is compiled.
+
+A field comes as {v >= level}: `Marchable` has turned it so. Index coordinates of field f are (x - origin[f]) /
+spacing[f] for x in the frame of the scene; t is world distance throughout.
 """
 
-import numba
-import numpy as np
-from numba.extending import register_jitable
+from typing import Any
 
+import numpy as np
+from numba.extending import overload, register_jitable
+
+from illumgrid.backends import bvh, lanes
+from illumgrid.backends.bvh import View, cast
+from illumgrid.backends.lanes import address, cached
+from illumgrid.levelset import Marchable
 from illumgrid.rng import draw, draw_pair, mix, net_size, partner, pascal, reverse, stream, upward
 
 for _function in (mix, stream, draw, reverse, pascal, upward, draw_pair, net_size, partner):
@@ -19,12 +29,27 @@ for _function in (mix, stream, draw, reverse, pascal, upward, draw_pair, net_siz
 # No fastmath: a miss is t = inf, and the sign of a coefficient near zero decides the side.
 # Nor Numba's reference counts: nothing is allocated here, the caller keeps the arrays alive, and the atomic counts of a
 # scene handed from function to function cost a third of the time.
-jit = numba.njit(cache=True, nogil=True, error_model="numpy", _nrt=False)  # type: ignore[call-overload]
+jit = cached(lanes, bvh, _nrt=False)
 
 MISS, SURFACE, CAP, BURIED, QUAD = 0, 1, 2, 3, 4  # a ray meets nothing, a level set, a cap, a solid's inside, a quad
 BRICK_SHIFT = 2  # bricks of 4 cells a side, as in levelset.BRICK
 ON_A_VOXEL = 1e-7  # as in illumgrid.volume
 ON_A_WALL = 1e-10  # a wall reaches this share of its size farther, so that walls joined at an edge leave no gap
+NOWHERE, LOST = -1, -2  # instead of a face: a surface that needs none; a query whose mesh is out of reach
+
+
+def either(marched: Any, meshed: Any) -> Any:
+    """One function for both surfaces: chosen by the type of the scene as it is compiled, or called as plain Python."""
+
+    def ask(scene, *rest):
+        return (marched if isinstance(scene, Marchable) else meshed)(scene, *rest)
+
+    @overload(ask, jit_options={"nogil": True, "error_model": "numpy", "_nrt": False})  # type: ignore[typeddict-unknown-key]
+    def _(scene, *rest):
+        chosen = marched if scene.instance_class is Marchable else meshed
+        return lambda scene, *rest: chosen(scene, *rest)
+
+    return ask
 
 
 @jit
@@ -285,29 +310,80 @@ def meet_quad(scene, q, x, d):
 
 
 @jit
-def nearest_hit(scene, level, x, d, on, on_cap):
+def march_from(scene, f, level, x, n, d, own, face, limit):
+    """First meeting of the frame ray x + t d with field f's trilinear solid, t < limit: (t, what, axis of a cap).
+
+    `own`: the ray starts on that solid, at a cap if `face` says so; then the convex box cannot be met again.
+    """
+    if own and face >= 0:
+        return np.inf, MISS, NOWHERE
+    sx, sy, sz = scene.spacing[f, 0], scene.spacing[f, 1], scene.spacing[f, 2]
+    ux = snap((x[0] - scene.origin[f, 0]) / sx)
+    uy = snap((x[1] - scene.origin[f, 1]) / sy)
+    uz = snap((x[2] - scene.origin[f, 2]) / sz)
+    return march(scene, f, level, ux, uy, uz, d[0] / sx, d[1] / sy, d[2] / sz, own, limit)
+
+
+@jit
+def cast_from(scene, f, x, d, limit):
+    """First face of field f's mesh along the frame ray x + t d: (t, number, whether it was met from the front)."""
+    tree = View(
+        address(scene.memory[scene.tree_start[f] :]),
+        scene.centre[f, 0], scene.centre[f, 1], scene.centre[f, 2], scene.scale[f],
+    )  # fmt: skip
+    t, face, _, _ = cast(tree, address(scene.stack), x[0], x[1], x[2], d[0], d[1], d[2], limit, False)
+    if face < 0:
+        return np.inf, NOWHERE, False
+    face += scene.face_start[f]
+    return t, face, dot(scene.facing[face], d) < 0.0
+
+
+@jit
+def mesh_from(scene, f, level, x, n, d, own, face, limit):
+    """First meeting of the frame ray x + t d with field f's mesh, t < limit: (t, what, face).
+
+    It starts on a surface of normal n, and if `own` on this mesh, on `face`. If it goes under that face it has met it
+    at once; else it starts off by what rounding may do. If it meets a back after that, it went under a neighbour.
+    """
+    off = scene.off[f]
+    if own:
+        n = (scene.facing[face, 0], scene.facing[face, 1], scene.facing[face, 2])
+        if dot(n, d) <= 0.0:
+            return 0.0, SURFACE, face
+        if scene.cap[face]:
+            return np.inf, MISS, NOWHERE
+    x = (x[0] + off * n[0], x[1] + off * n[1], x[2] + off * n[2])
+    t, met, front = cast_from(scene, f, x, d, limit)
+    if met == NOWHERE:
+        return np.inf, MISS, NOWHERE
+    if not front:
+        return 0.0, (SURFACE if own else BURIED), face
+    return t, (CAP if scene.cap[met] else SURFACE), met
+
+
+meet_solid = either(march_from, mesh_from)
+
+
+@jit
+def nearest_hit(scene, level, x, n, d, on, on_face):
     """First surface along the frame ray x + t d, from surface number `on` (-1: from nowhere): (t, number, what, face).
 
-    Fields count from 0, quads follow. A quad, and from a cap the convex box of a volume, cannot be met again; the level
-    set itself can.
+    The ray starts on a surface of normal n, 0 if on none.
+
+    `face` is the axis of a cap, or of a mesh the face; `on_face` is that of the start. Fields count from 0, quads
+    follow. A quad cannot be met again; the level set itself can.
     """
     fields = scene.start.shape[0]
-    best, number, what, face = np.inf, -1, MISS, -1
+    best, number, what, face = np.inf, -1, MISS, NOWHERE
     for q in range(scene.quad_corner.shape[0]):
         if fields + q != on:
             t = meet_quad(scene, q, x, d)
             if t < best:
-                best, number, what, face = t, fields + q, QUAD, -1
+                best, number, what, face = t, fields + q, QUAD, NOWHERE
     for f in range(fields):
-        if f == on and on_cap:
-            continue
-        sx, sy, sz = scene.spacing[f, 0], scene.spacing[f, 1], scene.spacing[f, 2]
-        ux = snap((x[0] - scene.origin[f, 0]) / sx)
-        uy = snap((x[1] - scene.origin[f, 1]) / sy)
-        uz = snap((x[2] - scene.origin[f, 2]) / sz)
-        t, hit, side = march(scene, f, level[f], ux, uy, uz, d[0] / sx, d[1] / sy, d[2] / sz, f == on, best)
+        t, hit, at = meet_solid(scene, f, level[f], x, n, d, f == on, on_face, best)
         if hit != MISS and t < best:
-            best, number, what, face = t, f, hit, side
+            best, number, what, face = t, f, hit, at
     return best, number, what, face
 
 
@@ -320,6 +396,22 @@ def outward(gx, gy, gz):
     gx, gy, gz = gx / largest, gy / largest, gz / largest
     length = np.sqrt(gx * gx + gy * gy + gz * gz)
     return -gx / length, -gy / length, -gz / length
+
+
+@jit
+def cell_normal(scene, f, ux, uy, uz):
+    """Outward normal at index u of the trilinear cell of field f that holds it."""
+    last_x, last_y, last_z = scene.shape[f, 0] - 1, scene.shape[f, 1] - 1, scene.shape[f, 2] - 1
+    cx, cy = follow(ux, 0.0, 0.0, 0, last_x - 1), follow(uy, 0.0, 0.0, 0, last_y - 1)
+    cz = follow(uz, 0.0, 0.0, 0, last_z - 1)
+    wx, wy, wz = min(max(ux - cx, 0.0), 1.0), min(max(uy - cy, 0.0), 1.0), min(max(uz - cz, 0.0), 1.0)
+    step_y = scene.shape[f, 2]
+    step_x = step_y * scene.shape[f, 1]
+    here = scene.start[f] + cx * step_x + cy * step_y + cz
+    _, gx, _, _ = cubic(scene.values, here, step_x, step_y, 0.0, wx, wy, wz, 1.0, 0.0, 0.0)
+    _, gy, _, _ = cubic(scene.values, here, step_x, step_y, 0.0, wx, wy, wz, 0.0, 1.0, 0.0)
+    _, gz, _, _ = cubic(scene.values, here, step_x, step_y, 0.0, wx, wy, wz, 0.0, 0.0, 1.0)
+    return outward(gx / scene.spacing[f, 0], gy / scene.spacing[f, 1], gz / scene.spacing[f, 2])
 
 
 @jit
@@ -346,32 +438,47 @@ def gradient_normal(scene, f, ux, uy, uz):
         gy += weight * (np.float64(v[here + after * step_y]) - v[here - before * step_y]) / (after + before)
         after, before = int(cz + k < last_z), int(cz + k > 0)
         gz += weight * (np.float64(v[here + after]) - v[here - before]) / (after + before)
-    sx, sy, sz = scene.spacing[f, 0], scene.spacing[f, 1], scene.spacing[f, 2]
     if gx == 0.0 and gy == 0.0 and gz == 0.0:
-        here = start + cx * step_x + cy * step_y + cz
-        _, gx, _, _ = cubic(v, here, step_x, step_y, 0.0, wx, wy, wz, 1.0, 0.0, 0.0)
-        _, gy, _, _ = cubic(v, here, step_x, step_y, 0.0, wx, wy, wz, 0.0, 1.0, 0.0)
-        _, gz, _, _ = cubic(v, here, step_x, step_y, 0.0, wx, wy, wz, 0.0, 0.0, 1.0)
-    return outward(gx / sx, gy / sy, gz / sz)
+        return cell_normal(scene, f, ux, uy, uz)
+    return outward(gx / scene.spacing[f, 0], gy / scene.spacing[f, 1], gz / scene.spacing[f, 2])
 
 
 @jit
-def hit_normal(scene, number, what, face, x, d):
-    """Normal where a ray met a surface: the gradient normal, that of the cap, or the side of the quad it came to."""
+def normal_by_field(scene, f, what, face, x, d):
+    """Normal where a ray along d met the trilinear solid of field f at x: the gradient normal, or that of the cap."""
     if what == CAP:
         return (
             -np.copysign(1.0, d[0]) if face == 0 else 0.0,
             -np.copysign(1.0, d[1]) if face == 1 else 0.0,
             -np.copysign(1.0, d[2]) if face == 2 else 0.0,
         )
+    ux = (x[0] - scene.origin[f, 0]) / scene.spacing[f, 0]
+    uy = (x[1] - scene.origin[f, 1]) / scene.spacing[f, 1]
+    uz = (x[2] - scene.origin[f, 2]) / scene.spacing[f, 2]
+    return gradient_normal(scene, f, ux, uy, uz)
+
+
+@jit
+def normal_on_mesh(scene, f, what, face, x, d):
+    """Normal where a ray met mesh f at x: the gradient normal; that of the face on a cap, or where there is none."""
+    n = normal_by_field(scene, f, SURFACE, NOWHERE, x, d)
+    if what == CAP or (n[0] == 0.0 and n[1] == 0.0 and n[2] == 0.0):
+        facing = scene.facing[face]
+        return facing[0], facing[1], facing[2]
+    return n
+
+
+solid_normal = either(normal_by_field, normal_on_mesh)
+
+
+@jit
+def hit_normal(scene, number, what, face, x, d):
+    """Normal where a ray met a surface: that of the solid, or of the side of the quad it came to."""
     if what == QUAD:
         normal = scene.quad_normal[number - scene.start.shape[0]]
         side = -np.copysign(1.0, dot(normal, d))
         return side * normal[0], side * normal[1], side * normal[2]
-    ux = (x[0] - scene.origin[number, 0]) / scene.spacing[number, 0]
-    uy = (x[1] - scene.origin[number, 1]) / scene.spacing[number, 1]
-    uz = (x[2] - scene.origin[number, 2]) / scene.spacing[number, 2]
-    return gradient_normal(scene, number, ux, uy, uz)
+    return solid_normal(scene, number, what, face, x, d)
 
 
 @jit
@@ -393,8 +500,11 @@ def cosine_direction(u1, u2, nx, ny, nz):
 
 
 @jit
-def holds(scene, f, level, ux, uy, uz):
-    """Whether index u lies in the solid {v >= level} of field f, its border included."""
+def in_solid(scene, f, level, x, n):
+    """Whether the frame point x lies in the trilinear solid {v >= level} of field f, its border included."""
+    ux = snap((x[0] - scene.origin[f, 0]) / scene.spacing[f, 0])
+    uy = snap((x[1] - scene.origin[f, 1]) / scene.spacing[f, 1])
+    uz = snap((x[2] - scene.origin[f, 2]) / scene.spacing[f, 2])
     last_x, last_y, last_z = scene.shape[f, 0] - 1, scene.shape[f, 1] - 1, scene.shape[f, 2] - 1
     if not (0.0 <= ux <= last_x and 0.0 <= uy <= last_y and 0.0 <= uz <= last_z):
         return False
@@ -407,15 +517,72 @@ def holds(scene, f, level, ux, uy, uz):
 
 
 @jit
-def buried(scene, level, x, own):
-    """Whether the frame point x lies inside the solid of a field other than `own`."""
-    for f in range(scene.start.shape[0]):
-        ux = snap((x[0] - scene.origin[f, 0]) / scene.spacing[f, 0])
-        uy = snap((x[1] - scene.origin[f, 1]) / scene.spacing[f, 1])
-        uz = snap((x[2] - scene.origin[f, 2]) / scene.spacing[f, 2])
-        if f != own and holds(scene, f, level[f], ux, uy, uz):
+def in_mesh(scene, f, level, x, n):
+    """Whether the frame point x lies inside the mesh of field f, or on it: a ray from beside x along n sees a back."""
+    off = scene.off[f]
+    x = (x[0] + off * n[0], x[1] + off * n[1], x[2] + off * n[2])
+    _, face, front = cast_from(scene, f, x, n, np.inf)
+    return face != NOWHERE and not front
+
+
+inside = either(in_solid, in_mesh)
+
+
+@jit
+def buried(scene, level, x, n, own):
+    """Whether the frame point x, on a surface of normal n, lies inside the solid of a field other than `own`."""
+    for f in range(scene.start.shape[0]):  # noqa: SIM110
+        if f != own and inside(scene, f, level[f], x, n):
             return True
     return False
+
+
+@jit
+def stay(scene, own, x, n):
+    """Queries lie on the trilinear set: nothing to do."""
+    return x, NOWHERE
+
+
+@jit
+def settle_along(scene, own, x, n):
+    """Move the frame point x along n onto mesh `own`: (position, face).
+
+    Against n there must be a front, or along it a back: the nearer one within a cell, no cap. So nothing lies between.
+    """
+    pace = max(
+        abs(n[0]) / scene.spacing[own, 0], abs(n[1]) / scene.spacing[own, 1], abs(n[2]) / scene.spacing[own, 2]
+    )  # cells along the axis on which it gains most
+    found, shift, face, near = np.inf, 0.0, LOST, 2.0 * scene.off[own]
+    for k in range(2):
+        along = 2.0 * k - 1.0
+        d = (along * n[0], along * n[1], along * n[2])
+        start = (x[0] - near * d[0], x[1] - near * d[1], x[2] - near * d[2])
+        t, met, front = cast_from(scene, own, start, d, near + 1.0 / pace)
+        if met != NOWHERE and front == (k == 0) and not scene.cap[met] and abs(t - near) < found:
+            found, shift, face = abs(t - near), along * (t - near), met
+    return (x[0] + shift * n[0], x[1] + shift * n[1], x[2] + shift * n[2]), face
+
+
+@jit
+def settle(scene, own, x, n):
+    """Move a query onto its own mesh, which lies a little beside the trilinear set: (position, face).
+
+    Along its normal, or where noise turns that aside, along the normal of its cell; LOST if neither leads there.
+    """
+    if own >= scene.start.shape[0]:
+        return x, NOWHERE
+    at, face = settle_along(scene, own, x, n)
+    if face == LOST:
+        ux = (x[0] - scene.origin[own, 0]) / scene.spacing[own, 0]
+        uy = (x[1] - scene.origin[own, 1]) / scene.spacing[own, 1]
+        uz = (x[2] - scene.origin[own, 2]) / scene.spacing[own, 2]
+        steep = cell_normal(scene, own, ux, uy, uz)
+        if steep[0] != 0.0 or steep[1] != 0.0 or steep[2] != 0.0:
+            at, face = settle_along(scene, own, x, steep)
+    return at, face
+
+
+begin = either(stay, settle)
 
 
 @jit
@@ -441,7 +608,7 @@ def lamp_density(scene, q, distance, d):
 
 
 @jit
-def light_from_lamps(scene, choice, u, v, level, on, on_cap, x, n):
+def light_from_lamps(scene, choice, u, v, level, on, on_face, x, n):
     """Share of a lamp's emission that arrives at x from one point of one lamp, and the lamp: (weight, quad).
 
     The weight is that of the balance heuristic: cosine density over the sum of both densities (Veach & Guibas 1995).
@@ -457,26 +624,26 @@ def light_from_lamps(scene, choice, u, v, level, on, on_cap, x, n):
     if by_cosine <= 0.0 or by_lamp <= 0.0 or number == on:
         return 0.0, q
     # The ray that meets this lamp first has met nothing else before.
-    _, met, _, _ = nearest_hit(scene, level, x, d, on, on_cap)
+    _, met, _, _ = nearest_hit(scene, level, x, n, d, on, on_face)
     return (by_cosine / (by_cosine + by_lamp) if met == number else 0.0), q
 
 
 @jit
-def walk(scene, key, path, bounces, level, own, x, n):
-    """Worth (red, green, blue) of one path from the frame point x, with normal n, on surface number `own`.
+def walk(scene, key, path, bounces, level, own, own_face, x, n):
+    """Worth (red, green, blue) of one path from the frame point x, with normal n, on `own_face` of surface `own`.
 
     The irradiance there is π times the mean over the paths.
     """
     red, green, blue = 0.0, 0.0, 0.0
     keep_red, keep_green, keep_blue = 1.0, 1.0, 1.0  # throughput: share of the light that comes back along the path
-    on, on_cap, fields = own, False, scene.start.shape[0]
+    on, on_face, fields = own, own_face, scene.start.shape[0]
     for segment in range(bounces + 1):
         # Ask a lamp for its light, weighted against the chance that the ray below finds it. One pair of numbers serves
         # both: each keeps its mean, and their shared boxes keep the error bars short.
         u1, u2 = draw_pair(key, path, np.uint64(segment))
         if scene.lamps.shape[0] > 0:
             choice = draw(key, path, np.uint64(segment))
-            weight, q = light_from_lamps(scene, choice, u1, u2, level, on, on_cap, x, n)
+            weight, q = light_from_lamps(scene, choice, u1, u2, level, on, on_face, x, n)
             red += keep_red * weight * scene.emission[fields + q, 0]
             green += keep_green * weight * scene.emission[fields + q, 1]
             blue += keep_blue * weight * scene.emission[fields + q, 2]
@@ -485,7 +652,7 @@ def walk(scene, key, path, bounces, level, own, x, n):
         d = cosine_direction(u1, u2, n[0], n[1], n[2])
 
         # Follow the ray to the nearest surface; one that dips under its own has hit it already.
-        t, number, what, face = nearest_hit(scene, level, x, d, on, on_cap)
+        t, number, what, face = nearest_hit(scene, level, x, n, d, on, on_face)
 
         # A path that escapes sees the background, and ends.
         if what == MISS:
@@ -512,7 +679,7 @@ def walk(scene, key, path, bounces, level, own, x, n):
         keep_red *= scene.albedo[number, 0]
         keep_green *= scene.albedo[number, 1]
         keep_blue *= scene.albedo[number, 2]
-        on, on_cap = number, what == CAP
+        on, on_face = number, face
         if t > 0.0 or what == QUAD:
             x = (x[0] + t * d[0], x[1] + t * d[1], x[2] + t * d[2])
             n = hit_normal(scene, number, what, face, x, d)
@@ -522,7 +689,7 @@ def walk(scene, key, path, bounces, level, own, x, n):
 
 
 @jit
-def mean_worth(scene, key, first, count, bounces, level, own, x, n):
+def mean_worth(scene, key, first, count, bounces, level, own, face, x, n):
     """Mean worth of paths number first .. first + count - 1 of one query, and their m2: six numbers.
 
     Collapsed strata: the range is cut into nets; within a net two paths that share a box differ by noise alone, however
@@ -536,7 +703,7 @@ def mean_worth(scene, key, first, count, bounces, level, own, x, n):
         size = net_size(at, left)
         mate = partner(size)
         for i in range(max(size // 2, 1)):
-            red, green, blue = walk(scene, key, np.uint64(at + i), bounces, level, own, x, n)
+            red, green, blue = walk(scene, key, np.uint64(at + i), bounces, level, own, face, x, n)
             sum_r, sum_g, sum_b = sum_r + red, sum_g + green, sum_b + blue
             if size == 1 and not lone:
                 lone, lone_r, lone_g, lone_b = True, red, green, blue
@@ -544,7 +711,8 @@ def mean_worth(scene, key, first, count, bounces, level, own, x, n):
             if size == 1:
                 other_r, other_g, other_b = lone_r, lone_g, lone_b
             else:
-                other_r, other_g, other_b = walk(scene, key, np.uint64(at + (i ^ mate)), bounces, level, own, x, n)
+                mate_path = np.uint64(at + (i ^ mate))
+                other_r, other_g, other_b = walk(scene, key, mate_path, bounces, level, own, face, x, n)
                 sum_r, sum_g, sum_b = sum_r + other_r, sum_g + other_g, sum_b + other_b
             off_r += (red - other_r) ** 2
             off_g += (green - other_g) ** 2
@@ -561,10 +729,13 @@ def solve_queries(scene, ids, point, normal, level, target, first, count, bounce
     """Irradiance at queries in frame coordinates, from `count` paths from number `first` on; fills mean, m2, paths."""
     for i in range(ids.shape[0]):
         x, n = (point[i, 0], point[i, 1], point[i, 2]), (normal[i, 0], normal[i, 1], normal[i, 2])
-        if (n[0] == 0.0 and n[1] == 0.0 and n[2] == 0.0) or buried(scene, level[i], x, target[i]):
+        if n[0] == 0.0 and n[1] == 0.0 and n[2] == 0.0:
+            continue
+        x, face = begin(scene, target[i], x, n)
+        if face == LOST or buried(scene, level[i], x, n, target[i]):
             continue
         key = stream(seed, ids[i])
-        r, g, b, off_r, off_g, off_b = mean_worth(scene, key, first, count, bounces, level[i], target[i], x, n)
+        r, g, b, off_r, off_g, off_b = mean_worth(scene, key, first, count, bounces, level[i], target[i], face, x, n)
         mean[i, 0], mean[i, 1], mean[i, 2] = np.pi * r, np.pi * g, np.pi * b
         m2[i, 0], m2[i, 1], m2[i, 2] = np.pi**2 * off_r, np.pi**2 * off_g, np.pi**2 * off_b
         paths[i] = count
@@ -576,17 +747,17 @@ def cast_rays(scene, level, origin, direction, on, t, number, what, normal):
 
     Rays from nowhere (`on` is -1) are those of a camera: they see the fronts of quads only.
     """
-    fields = scene.start.shape[0]
+    fields, none = scene.start.shape[0], (0.0, 0.0, 0.0)
     for i in range(origin.shape[0]):
         x, d = (origin[i, 0], origin[i, 1], origin[i, 2]), (direction[i, 0], direction[i, 1], direction[i, 2])
         through, start, passed = on, x, 0.0
-        t[i], number[i], what[i], face = nearest_hit(scene, level, x, d, on, False)
+        t[i], number[i], what[i], face = nearest_hit(scene, level, x, none, d, on, NOWHERE)
         while on < 0 and what[i] == QUAD and dot(scene.quad_normal[number[i] - fields], d) >= 0.0:
             # A wall seen from behind is not there: go on from it.
             passed += t[i]
             through = number[i]
             start = (x[0] + passed * d[0], x[1] + passed * d[1], x[2] + passed * d[2])
-            t[i], number[i], what[i], face = nearest_hit(scene, level, start, d, through, False)
+            t[i], number[i], what[i], face = nearest_hit(scene, level, start, none, d, through, NOWHERE)
         t[i] += passed
         if what[i] != MISS and what[i] != BURIED:
             hit = (x[0] + t[i] * d[0], x[1] + t[i] * d[1], x[2] + t[i] * d[2])

@@ -24,13 +24,15 @@ from numba.extending import lower_builtin, models, register_model, type_callable
 WIDE = 8
 
 
-def cached(*sources: ModuleType) -> Callable[[Any], Any]:
+def cached(*sources: ModuleType, **options: Any) -> Callable[[Any], Any]:
     """Compile a function into a disk cache that sees edits in other modules too.
 
     Parameters
     ----------
     *sources : module
         All whose functions end up in the compiled code, apart from the function's own module and what is frozen.
+    **options
+        More for Numba.
 
     Returns
     -------
@@ -47,7 +49,7 @@ def cached(*sources: ModuleType) -> Callable[[Any], Any]:
     def compiled(function: Any) -> Any:
         function.__qualname__ += f"_{digest}"
         # No fastmath: what is computed must not depend on the processor, and infinity means something.
-        return numba.njit(cache=True, nogil=True, error_model="numpy")(function)
+        return numba.njit(cache=True, nogil=True, error_model="numpy", **options)(function)
 
     return compiled
 

@@ -1,17 +1,21 @@
-"""Light transport by compiled kernels that march the trilinear level set: no mesh, no build for a new isovalue."""
+"""Light transport by compiled kernels: they march the trilinear level set, or cast rays at its mesh."""
 
 import os
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from illumgrid.errors import BadInput
 from illumgrid.levelset import in_frame, marchable
 from illumgrid.samples import Queries, Samples, check_request
 from illumgrid.scene import Scene
 from illumgrid.stages import Backend, hookimpl
+
+Rows = slice | NDArray[np.int64]
 
 
 def cores() -> int:
@@ -21,21 +25,29 @@ def cores() -> int:
 
 @dataclass(frozen=True)
 class Numba:
-    """Paths by Numba kernels that march the trilinear level set.
+    """Paths by Numba kernels.
 
     Parameters
     ----------
     threads : int
         Threads that share the queries; 0 takes one for each processor. The answer does not depend on it.
+    surface : {"auto", "levelset", "mesh"}
+        What stands for a level set. "levelset" marches the trilinear field: nothing is built, every query may have a
+        level of its own. "mesh" casts rays at the marching-cubes mesh, which differs by O(spacing²): one is built for
+        each row of levels, at most `meshes.MOST_ROWS`. "auto" is "levelset": one request does not tell how many rays
+        its meshes will serve in all, and an answer must not depend on it.
     """
 
     name: ClassVar[str] = "numba"
-    geometry: ClassVar[Literal["mesh", "levelset", "both"]] = "levelset"
+    geometry: ClassVar[Literal["mesh", "levelset", "both"]] = "both"
     threads: int = 0
+    surface: str = "auto"
 
     def __post_init__(self) -> None:
         if self.threads < 0:
             raise BadInput(f"{self.threads} threads were asked for; expected a positive number, or 0 for all")
+        if self.surface not in ("auto", "levelset", "mesh"):
+            raise BadInput(f"the surface is {self.surface!r}; expected 'auto', 'levelset' or 'mesh'")
 
     def solve(self, scene: Scene, queries: Queries, *, paths: range, bounces: int, seed: int) -> Samples:
         """Trace paths from every query: see `illumgrid.stages.Backend`."""
@@ -48,32 +60,65 @@ class Numba:
             return answer
         from illumgrid.backends.kernels import solve_queries
 
-        fields = marchable(scene)
         point, normal, level = in_frame(scene, queries)
 
-        def chunk(rows: slice) -> None:
+        def chunk(surfaces: Any, rows: Rows) -> None:
+            if "stack" in surfaces._fields:  # each piece of work has a stack of its own
+                surfaces = surfaces._replace(stack=surfaces.stack.copy())
+            light = np.zeros((len(queries.id[rows]), 3), np.float32)
+            spread, good = np.zeros_like(light), np.zeros(len(light), np.int32)
             # Random numbers wrap around and misses are infinite, on purpose; without the JIT NumPy would warn of it.
             with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
                 solve_queries(
-                    fields, queries.id[rows], point[rows], normal[rows], level[rows], queries.target[rows],
-                    paths.start, len(paths), bounces, np.uint64(seed), mean[rows], m2[rows], count[rows],
+                    surfaces, queries.id[rows], point[rows], normal[rows], level[rows], queries.target[rows],
+                    paths.start, len(paths), bounces, np.uint64(seed), light, spread, good,
                 )  # fmt: skip
+            mean[rows], m2[rows], count[rows] = light, spread, good
 
-        chunk(slice(0, 0))  # compiles here, where Ctrl-C is heard, and once
         threads = self.threads or cores()
         # Ctrl-C waits for the chunks at work: at most a million paths each.
         size = max(1, min(1024, max(16, n // (8 * threads) + 1), (1 << 20) // len(paths)))
-        chunks = [slice(i, i + size) for i in range(0, n, size)]
-        if threads == 1 or len(chunks) == 1:
-            for rows in chunks:
-                chunk(rows)
-            return answer
-        pool = ThreadPoolExecutor(threads)
-        try:
-            list(pool.map(chunk, chunks))
-        finally:
-            pool.shutdown(cancel_futures=True)  # on Ctrl-C the chunks that wait are dropped
+        pieces = (
+            (surfaces, members[i : i + size])
+            for surfaces, members in self._surfaces(scene, queries.level)
+            for i in range(0, len(members), size)
+        )
+        share(chunk, pieces, threads)
         return answer
+
+    def _surfaces(self, scene: Scene, level: NDArray[np.float64]) -> Iterator[tuple[Any, NDArray[np.int64]]]:
+        """What the rays meet, and the queries for which it does."""
+        if self.surface != "mesh":
+            yield marchable(scene), np.arange(len(level))
+            return
+        from illumgrid.backends.meshes import meshed, row_groups
+
+        for row, members in row_groups(scene, level):
+            yield meshed(scene, row), members
+
+
+def share(work: Callable[..., None], pieces: Iterator[tuple[Any, ...]], threads: int) -> None:
+    """Do the work on all pieces, the first one in the caller's thread: there it compiles, and Ctrl-C is heard."""
+    first = next(pieces)
+    work(*first)
+    if threads == 1:
+        for piece in pieces:
+            work(*piece)
+        return
+    pool = ThreadPoolExecutor(threads)
+    try:
+        # Pieces are made while others are at work, but not many before their turn.
+        waiting: set[Future[None]] = set()
+        for piece in pieces:
+            waiting.add(pool.submit(work, *piece))
+            if len(waiting) >= 4 * threads:
+                done, waiting = wait(waiting, return_when=FIRST_COMPLETED)
+                for future in done:
+                    future.result()
+        for future in waiting:
+            future.result()
+    finally:
+        pool.shutdown(cancel_futures=True)  # on Ctrl-C the chunks that wait are dropped
 
 
 @hookimpl

@@ -1,12 +1,13 @@
 """The same paths in pure NumPy, written to be read: all rays of a batch take each step together.
 
-The path loop has the headings of `kernels.walk`; everything that Numba's kernels do for speed is left out.
+The path loop has the headings of `kernels.walk`; everything that Numba's kernels do for speed is left out. What rays
+meet is handed in: the trilinear level set here, its mesh in `embree`.
 """
 
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,8 +23,32 @@ Bools = NDArray[np.bool_]
 Ints = NDArray[np.int64]
 
 MISS, SURFACE, CAP, BURIED, QUAD = 0, 1, 2, 3, 4
+NOWHERE, LOST = -1, -2
+BATCH = 1 << 15  # rays that take a step together
 ON_A_WALL = 1e-10  # a wall reaches this share of its size farther, so that walls joined at an edge leave no gap
 _CORNERS = np.array(list(np.ndindex(2, 2, 2)))
+
+
+class Surfaces(Protocol):
+    """The solids of all fields, as rays meet them. A `face` is the axis of a cap, or the face of a mesh, or NOWHERE."""
+
+    @property
+    def scene(self) -> Marchable:
+        """All else that there is."""
+
+    def meet(
+        self, f: int, level: Floats, x: Floats, normal: Floats, d: Floats, own: Bools, face: Ints
+    ) -> tuple[Floats, Ints, Ints]:
+        """First meeting (t, what, face), each (n,), of frame rays with field f; `own` rays start on it, on `face`."""
+
+    def normal(self, f: int, what: Ints, face: Ints, x: Floats, d: Floats) -> Floats:
+        """Normals (n, 3) where rays along d met field f at x."""
+
+    def begin(self, own: Ints, x: Floats, normal: Floats) -> tuple[Floats, Ints]:
+        """Move queries onto the surface that stands for their level set: (position, face); LOST if there is none."""
+
+    def inside(self, f: int, level: Floats, x: Floats, normal: Floats) -> Bools:
+        """Whether points x on other surfaces lie inside the solid of field f."""
 
 
 def voxels(scene: Marchable, f: int) -> NDArray[np.float32]:
@@ -161,22 +186,19 @@ def meet_quad(scene: Marchable, q: int, x: Floats, d: Floats) -> Floats:
 
 
 def nearest_hit(
-    scene: Marchable, level: Floats, x: Floats, d: Floats, on: Ints, on_cap: Bools
+    surfaces: Surfaces, level: Floats, x: Floats, normal: Floats, d: Floats, on: Ints, on_face: Ints
 ) -> tuple[Floats, Ints, Ints, Ints]:
-    """First surface along frame rays: (t, number, what, axis of a cap), each (n,); fields come first, then quads."""
-    n, fields = len(x), len(scene.start)
-    best, number, what, face = np.full(n, np.inf), np.full(n, -1), np.full(n, MISS), np.full(n, -1)
+    """First surface along frame rays, which start on these normals: (t, number, what, face); fields come first."""
+    scene, n = surfaces.scene, len(x)
+    best, number, what, face = np.full(n, np.inf), np.full(n, -1), np.full(n, MISS), np.full(n, NOWHERE)
     for q in range(len(scene.quad_corner)):
-        t = np.where(on == fields + q, np.inf, meet_quad(scene, q, x, d))
+        t = np.where(on == len(scene.start) + q, np.inf, meet_quad(scene, q, x, d))
         closer = t < best
-        best[closer], number[closer], what[closer] = t[closer], fields + q, QUAD
-    for f in range(fields):
-        ray = np.flatnonzero(~((on == f) & on_cap))  # from a cap, the convex box cannot be met again
-        start = index_of(scene, f, x[ray])
-        t, hit, axis = march(voxels(scene, f), level[ray, f], start, d[ray] / scene.spacing[f], on[ray] == f)
-        closer = (hit != MISS) & (t < best[ray])
-        ray = ray[closer]
-        best[ray], number[ray], what[ray], face[ray] = t[closer], f, hit[closer], axis[closer]
+        best[closer], number[closer], what[closer] = t[closer], len(scene.start) + q, QUAD
+    for f in range(len(scene.start)):
+        t, hit, at = surfaces.meet(f, level[:, f], x, normal, d, on == f, on_face)
+        closer = (hit != MISS) & (t < best)
+        best[closer], number[closer], what[closer], face[closer] = t[closer], f, hit[closer], at[closer]
     return best, number, what, face
 
 
@@ -195,15 +217,59 @@ def gradient_normal(scene: Marchable, f: int, x: Floats) -> Floats:
             before[:, axis] = np.maximum(before[:, axis] - 1, 0)
             rise = v[tuple(after.T)].astype(float) - v[tuple(before.T)]
             gradient[:, axis] += weight * rise / (after - before)[:, axis]
-    flat = ~gradient.any(axis=1)
-    for axis in range(3):
-        step = np.tile(np.eye(3)[axis], (int(flat.sum()), 1))
-        gradient[flat, axis] = cubic(v, np.zeros(len(step)), cell[flat], e[flat], step)[:, 1]
-    gradient /= scene.spacing[f]
+    known = gradient.any(axis=1, keepdims=True)
+    return np.where(known, outward(gradient / scene.spacing[f]), cell_normal(scene, f, x))
+
+
+def cell_normal(scene: Marchable, f: int, x: Floats) -> Floats:
+    """Outward unit normals (n, 3) of the trilinear cells that hold frame points."""
+    v, last = voxels(scene, f), scene.shape[f] - 1
+    u = (x - scene.origin[f]) / scene.spacing[f]
+    cell = np.clip(np.floor(u), 0, last - 1).astype(np.int64)
+    steps = (np.tile(step, (len(x), 1)) for step in np.eye(3))
+    slopes = [cubic(v, np.zeros(len(x)), cell, np.clip(u - cell, 0.0, 1.0), step)[:, 1] for step in steps]
+    return outward(np.stack(slopes, axis=1) / scene.spacing[f])
+
+
+def outward(gradient: Floats) -> Floats:
+    """Unit vectors (n, 3) against gradients; 0 where they are 0. Scaled first: a tiny slope's square underflows."""
     largest = np.abs(gradient).max(axis=1, keepdims=True, initial=0.0)
     gradient = gradient / np.where(largest > 0, largest, 1.0)
     length = np.linalg.norm(gradient, axis=1, keepdims=True)
     return -gradient / np.where(length > 0, length, 1.0)
+
+
+@dataclass(frozen=True)
+class Marching:
+    """Rays that march the trilinear fields."""
+
+    scene: Marchable
+
+    def meet(
+        self, f: int, level: Floats, x: Floats, normal: Floats, d: Floats, own: Bools, face: Ints
+    ) -> tuple[Floats, Ints, Ints]:
+        """From a cap the convex box cannot be met again: see `Surfaces`."""
+        t, what, at = np.full(len(x), np.inf), np.full(len(x), MISS), np.full(len(x), NOWHERE)
+        ray = np.flatnonzero(~(own & (face != NOWHERE)))
+        start, step = index_of(self.scene, f, x[ray]), d[ray] / self.scene.spacing[f]
+        t[ray], what[ray], at[ray] = march(voxels(self.scene, f), level[ray], start, step, own[ray])
+        return t, what, at
+
+    def normal(self, f: int, what: Ints, face: Ints, x: Floats, d: Floats) -> Floats:
+        """The gradient normal, or that of the cap."""
+        cap = -np.sign(d) * (face[:, None] == np.arange(3))
+        return np.where((what == CAP)[:, None], cap, gradient_normal(self.scene, f, x))
+
+    def begin(self, own: Ints, x: Floats, normal: Floats) -> tuple[Floats, Ints]:
+        """Queries lie on the trilinear set."""
+        return x, np.full(len(x), NOWHERE)
+
+    def inside(self, f: int, level: Floats, x: Floats, normal: Floats) -> Bools:
+        """By the trilinear value, the border included."""
+        u, last = index_of(self.scene, f, x), self.scene.shape[f] - 1
+        cell = np.clip(np.floor(u), 0, last - 1).astype(np.int64)
+        q = cubic(voxels(self.scene, f), level, cell, u - cell, np.zeros_like(u))
+        return np.asarray(((u >= 0) & (u <= last)).all(axis=1) & (q[:, 0] >= 0))
 
 
 def cosine_direction(u1: Floats, u2: Floats, normal: Floats) -> Floats:
@@ -227,13 +293,14 @@ def lamp_density(scene: Marchable, q: Ints, distance: Floats, d: Floats) -> Floa
 
 
 def light_from_lamps(
-    scene: Marchable, u: Floats, level: Floats, on: Ints, on_cap: Bools, x: Floats, normal: Floats
+    surfaces: Surfaces, u: Floats, level: Floats, on: Ints, on_face: Ints, x: Floats, normal: Floats
 ) -> tuple[Floats, Ints]:
     """Share (n,) of a lamp's emission that arrives at x from one point of one lamp, and the number (n,) of the quad.
 
     The lamp is chosen in proportion to its power, the point uniform by area, from the numbers u (n, 3). The weight is
     that of the balance heuristic: cosine density over the sum of both densities (Veach & Guibas 1995).
     """
+    scene = surfaces.scene
     lamp = np.minimum(np.searchsorted(scene.lamp_share, u[:, 2], side="right"), len(scene.lamps) - 1)
     q = scene.lamps[lamp]
     target = scene.quad_corner[q] + np.einsum("ni,nij->nj", u[:, :2], scene.quad_edges[q])
@@ -243,41 +310,44 @@ def light_from_lamps(
     number = len(scene.start) + q
     ask = np.flatnonzero((distance > 0) & (by_cosine > 0) & (by_lamp > 0) & (number != on))
     # The ray that meets this lamp first has met nothing else before.
-    _, met, _, _ = nearest_hit(scene, level[ask], x[ask], d[ask], on[ask], on_cap[ask])
+    _, met, _, _ = nearest_hit(surfaces, level[ask], x[ask], normal[ask], d[ask], on[ask], on_face[ask])
     weight = np.zeros(len(x))
     weight[ask] = np.where(met == number[ask], by_cosine[ask] / (by_cosine[ask] + by_lamp[ask]), 0.0)
     return weight, number
 
 
 def walk(
-    scene: Marchable,
+    surfaces: Surfaces,
     key: NDArray[np.uint64],
-    path: int,
+    path: NDArray[np.uint64],
     bounces: int,
     level: Floats,
     own: Ints,
+    own_face: Ints,
     x: Floats,
     normal: Floats,
 ) -> Floats:
     """Worth (n, 3) of one path from each point of a surface: the irradiance is π times the mean."""
+    scene = surfaces.scene
     worth, keep = np.zeros((len(x), 3)), np.ones((len(x), 3))  # keep: share of the light that comes back along the path
-    x, normal, on, on_cap = x.copy(), normal.copy(), own.astype(np.int64), np.zeros(len(x), bool)
+    x, normal, on, on_face = x.copy(), normal.copy(), own.astype(np.int64), own_face.copy()
     alive, fields = np.arange(len(x)), len(scene.start)
     for segment in range(bounces + 1):
         # Ask a lamp for its light, weighted against the chance that the ray below finds it. One pair of numbers serves
         # both: each keeps its mean, and their shared boxes keep the error bars short.
-        u1, u2 = draw_pair(key[alive], np.uint64(path), np.uint64(segment))
+        u1, u2 = draw_pair(key[alive], path[alive], np.uint64(segment))
         if len(scene.lamps):
-            u = np.stack([u1, u2, draw(key[alive], np.uint64(path), np.uint64(segment))], axis=1)
-            at = (level[alive], on[alive], on_cap[alive], x[alive], normal[alive])
-            weight, number = light_from_lamps(scene, u, *at)
+            u = np.stack([u1, u2, draw(key[alive], path[alive], np.uint64(segment))], axis=1)
+            at = (level[alive], on[alive], on_face[alive], x[alive], normal[alive])
+            weight, number = light_from_lamps(surfaces, u, *at)
             worth[alive] += keep[alive] * weight[:, None] * scene.emission[number]
 
         # Choose a direction by the cosine about the normal.
         d = cosine_direction(u1, u2, normal[alive])
 
         # Follow the ray to the nearest surface; one that dips under its own has hit it already.
-        t, number, what, face = nearest_hit(scene, level[alive], x[alive], d, on[alive], on_cap[alive])
+        start = level[alive], x[alive], normal[alive]
+        t, number, what, face = nearest_hit(surfaces, *start, d, on[alive], on_face[alive])
 
         # A path that escapes sees the background, and ends.
         escaped = alive[what == MISS]
@@ -298,28 +368,15 @@ def walk(
 
         # Reflect: the albedo takes its share, and the path goes on from the hit.
         keep[alive] *= scene.albedo[number]
-        on[alive], on_cap[alive] = number, what == CAP
+        on[alive], on_face[alive] = number, face
         moved = (t > 0) | wall
         x[alive] += np.where(moved, t, 0.0)[:, None] * d
         for f in range(fields):
-            here = moved & (number == f) & (what == SURFACE)
-            normal[alive[here]] = gradient_normal(scene, f, x[alive[here]])
-        cap = moved & (what == CAP)
-        normal[alive[cap]] = -np.sign(d[cap]) * (face[cap, None] == np.arange(3))
+            here = np.flatnonzero(moved & (number == f))
+            normal[alive[here]] = surfaces.normal(f, what[here], face[here], x[alive[here]], d[here])
         normal[alive[wall]] = -np.sign(approach)[:, None] * scene.quad_normal[quad]
         alive = alive[normal[alive].any(axis=1)]
     return worth
-
-
-def holes(scene: Marchable, level: Floats, x: Floats, normal: Floats, target: Ints) -> Bools:
-    """Queries (n,) without a normal, or inside the solid of a field that is not their own."""
-    bad: Bools = np.asarray(~normal.any(axis=1))
-    for f in range(len(scene.start)):
-        u, last = index_of(scene, f, x), scene.shape[f] - 1
-        cell = np.clip(np.floor(u), 0, last - 1).astype(np.int64)
-        q = cubic(voxels(scene, f), level[:, f], cell, u - cell, np.zeros_like(u))
-        bad |= (target != f) & ((u >= 0) & (u <= last)).all(axis=1) & (q[:, 0] >= 0)
-    return bad
 
 
 def couples(paths: range) -> Iterator[tuple[int, int | None]]:
@@ -336,6 +393,36 @@ def couples(paths: range) -> Iterator[tuple[int, int | None]]:
         yield alone[0], alone[1] if len(alone) == 2 else None
 
 
+def answer(
+    surfaces: Surfaces, key: NDArray[np.uint64], level: Floats, target: Ints, x: Floats, normal: Floats,
+    paths: range, bounces: int,
+) -> tuple[Floats, Floats, Bools]:  # fmt: skip
+    """Mean (n, 3) and m2 (n, 3) of the irradiance at queries in the frame, and which are no holes (n,).
+
+    A hole has no normal, no surface within reach, or lies inside the solid of a field that is not its own.
+    """
+    mean, m2 = np.zeros((len(x), 3)), np.zeros((len(x), 3))
+    x, face = surfaces.begin(target, x, normal)
+    good = normal.any(axis=1) & (face != LOST)
+    for f in range(len(surfaces.scene.start)):
+        good &= (target == f) | ~surfaces.inside(f, level[:, f], x, normal)
+    start, n = (level[good], target[good], face[good], x[good], normal[good]), int(good.sum())
+    pairs = list(couples(paths))
+    step = max(1, BATCH // (2 * max(n, 1)))
+    coupled = 0
+    for at in range(0, len(pairs), step):
+        block = np.array([p for pair in pairs[at : at + step] for p in pair if p is not None], np.uint64)
+        with np.errstate(over="ignore"):  # the random numbers wrap around, on purpose
+            every = np.repeat(np.arange(n), len(block))
+            light = walk(surfaces, key[good][every], np.tile(block, n), bounces, *(part[every] for part in start))
+        light = np.pi * light.reshape(n, len(block), 3)
+        mean[good] += light.sum(axis=1) / len(paths)
+        even = len(block) // 2 * 2
+        m2[good] += ((light[:, 0:even:2] - light[:, 1:even:2]) ** 2).sum(axis=1)
+        coupled += even
+    return mean, m2 * (len(paths) - 1) / max(coupled, 1), good
+
+
 @dataclass(frozen=True)
 class Reference:
     """The same paths as `numba`, in pure NumPy: slow, and easy to check."""
@@ -346,24 +433,12 @@ class Reference:
     def solve(self, scene: Scene, queries: Queries, *, paths: range, bounces: int, seed: int) -> Samples:
         """Trace paths from every query: see `illumgrid.stages.Backend`."""
         check_request(paths, bounces)
-        fields = marchable(scene)
         point, normal, level = in_frame(scene, queries)
-        mean, m2 = np.zeros((len(queries), 3)), np.zeros((len(queries), 3))
-        good = ~holes(fields, level, point, normal, queries.target.astype(np.int64))
-        own, row, x, n = queries.target[good].astype(np.int64), level[good], point[good], normal[good]
-        with np.errstate(over="ignore"):  # the random numbers wrap around, on purpose
-            key = stream(np.uint64(seed), queries.id[good])
-            paired = 0
-            for one, other in couples(paths):
-                worth = walk(fields, key, one, bounces, row, own, x, n)
-                mean[good] += np.pi * worth / len(paths)
-                if other is not None:
-                    second = walk(fields, key, other, bounces, row, own, x, n)
-                    m2[good] += (np.pi * (worth - second)) ** 2
-                    mean[good] += np.pi * second / len(paths)
-                    paired += 2
+        with np.errstate(over="ignore"):
+            key = stream(np.uint64(seed), queries.id)
+        surfaces = Marching(marchable(scene))
+        mean, m2, good = answer(surfaces, key, level, queries.target.astype(np.int64), point, normal, paths, bounces)
         count = np.where(good, len(paths), 0).astype(np.int32)
-        m2 *= (len(paths) - 1) / max(paired, 1)
         return Samples(queries, mean.astype(np.float32), m2.astype(np.float32), count)
 
 

@@ -1,0 +1,89 @@
+"""How many whole paths a second each backend walks: ``python benchmarks/paths.py [--json FILE]``.
+
+open
+    A smooth 64³ field, the sum of forty Gaussians, under a sky, 4 bounces: most paths escape soon. No lamps.
+box
+    The same field in the closed box with its luminaire, 6 bounces: every path is as long as it may be, and at each
+    reflection a lamp is asked for its light.
+
+Queries are uniform by area on one level set, so that a mesh serves them all; what is built first is timed beside. One
+thread each and then two; the contenders take turns in one process: a rate is the best of the rounds, a ratio the
+median of the ratios within the rounds. `enough` is the number of paths from which a mesh repays its building.
+"""
+
+import argparse
+import json
+import time
+from dataclasses import replace
+
+import numpy as np
+from rays import gaussians
+
+from illumgrid.backends import meshes
+from illumgrid.scene import Scene
+from illumgrid.stages import on_level_sets
+from illumgrid.verify import contenders
+
+LEVEL, ROUNDS, QUERIES = 0.4, 5, 2000
+PATHS = {"numba:levelset": 64, "numba:mesh": 64, "embree": 16}  # reference is for reading, some 500 times slower
+
+
+def timed(work):
+    begun = time.perf_counter()
+    work()
+    return time.perf_counter() - begun
+
+
+def measure(scene, bounces):
+    """Figures of one scene."""
+    (queries,) = on_level_sets(scene, [LEVEL], 0, points=QUERIES)
+    works = {}
+    for name, backend in contenders().items():
+        for threads in (1, 2) if name in PATHS else ():
+            stage = replace(backend, threads=threads)
+
+            def work(stage=stage, count=PATHS[name]):
+                stage.solve(scene, queries, paths=range(count), bounces=bounces, seed=0)
+
+            works[name, threads] = work
+            work()
+    build = min(timed(lambda: meshes._build(scene.fields[0].volume, LEVEL, "above")) for _ in range(3))
+    seconds = np.array([[timed(work) for work in works.values()] for _ in range(ROUNDS)])
+    each = dict(zip(works, seconds.T))
+    rate = {key: PATHS[key[0]] * len(queries) / spent for key, spent in each.items()}
+    best = rate["numba:levelset", 1]
+    figures = {"mesh to build, seconds": build}
+    for name in dict.fromkeys(name for name, _ in works):
+        own = {"paths a second": float(rate[name, 1].max()), "times marching": float(np.median(rate[name, 1] / best))}
+        if (name, 2) in rate:
+            own["two threads"] = float(np.median(rate[name, 2] / rate[name, 1]))
+        figures[name] = own
+    gain = 1 / rate["numba:levelset", 1].max() - 1 / rate["numba:mesh", 1].max()
+    figures["enough"] = build / gain if gain > 0 else float("inf")
+    return figures
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--json", help="write the figures here")
+    asked = parser.parse_args()
+    volume = gaussians(64)
+    found = {}
+    for name, scene, bounces in (
+        ("open", Scene.sky(volume, range=(0.2, 0.9)), 4),
+        ("box", Scene.box(volume, range=(0.2, 0.9)), 6),
+    ):
+        found[name] = figures = measure(scene, bounces)
+        print(f"{name}: a mesh takes {figures['mesh to build, seconds']:.2f} s and repays after "
+              f"{figures['enough']:.3g} paths")  # fmt: skip
+        for who, own in figures.items():
+            if isinstance(own, dict):
+                two = f", two threads {own['two threads']:.2f} times one" if "two threads" in own else ""
+                print(f"  {who:15} {own['paths a second']:10.3g} paths/s, {own['times marching']:.2f} x marching{two}")
+    if asked.json:
+        with open(asked.json, "w") as file:
+            json.dump(found, file, indent=2)
+
+
+if __name__ == "__main__":
+    main()

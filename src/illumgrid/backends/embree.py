@@ -1,0 +1,233 @@
+"""Light transport over Intel's Embree (the optional package embreex): the NumPy path loop, all rays of a step at once.
+
+Embree sees the meshes that `numba` sees with ``surface="mesh"``, in the same single precision, so that both walk the
+same paths but where a ray grazes an edge.
+"""
+
+import importlib.util
+import weakref
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from illumgrid.backends.meshes import LevelMesh, level_mesh, meshed, row_groups
+from illumgrid.backends.numba_ import cores, share
+from illumgrid.backends.reference import (
+    BURIED,
+    CAP,
+    LOST,
+    MISS,
+    NOWHERE,
+    SURFACE,
+    Bools,
+    Ints,
+    answer,
+    cell_normal,
+    gradient_normal,
+)
+from illumgrid.errors import BadInput
+from illumgrid.levelset import in_frame
+from illumgrid.rng import stream
+from illumgrid.samples import Queries, Samples, check_request
+from illumgrid.scene import Scene
+from illumgrid.stages import Backend, hookimpl
+from illumgrid.volume import Floats
+
+Cast = Callable[[int, Floats, Floats], tuple[Floats, Ints]]
+"""First face of field f's mesh along frame rays (n, 3): distance and number in that mesh, each (n,); inf, -1: none."""
+
+
+@dataclass(frozen=True)
+class Casting:
+    """Rays that are cast at the meshes of one row of levels, by whoever can: see `kernels.mesh_from`.
+
+    Parameters
+    ----------
+    scene : Meshed
+    cast : callable
+    """
+
+    scene: Any
+    cast: Cast
+
+    def first(self, f: int, x: Floats, d: Floats) -> tuple[Floats, Ints, Bools]:
+        """First face along rays: (t, number among those of all fields, whether it was met from the front)."""
+        t, face = self.cast(f, x, d)
+        number, front = np.full(len(x), NOWHERE), np.zeros(len(x), bool)
+        hit = np.flatnonzero(face >= 0)
+        number[hit] = face[hit] + self.scene.face_start[f]
+        front[hit] = np.einsum("ij,ij->i", self.scene.facing[number[hit]], d[hit]) < 0
+        return t, number, front
+
+    def meet(
+        self, f: int, level: Floats, x: Floats, normal: Floats, d: Floats, own: Bools, face: Ints
+    ) -> tuple[Floats, Ints, Ints]:
+        """A ray that goes under its own face has met it at once; else it starts off by what rounding may do."""
+        t, what, at = np.full(len(x), np.inf), np.full(len(x), MISS), np.full(len(x), NOWHERE)
+        ray = np.flatnonzero(own)
+        facing = normal.copy()
+        facing[ray] = self.scene.facing[face[ray]]
+        dips = np.einsum("ij,ij->i", facing[ray], d[ray]) <= 0
+        under = ray[dips]
+        t[under], what[under], at[under] = 0.0, SURFACE, face[under]
+        stays = np.zeros(len(x), bool)
+        stays[ray] = dips | self.scene.cap[face[ray]]  # from a cap the convex box cannot be met again
+
+        ray = np.flatnonzero(~stays)
+        far, met, front = self.first(f, (x + self.scene.off[f] * facing)[ray], d[ray])
+        hit, back = ray[front], ray[(met != NOWHERE) & ~front]
+        t[hit], at[hit] = far[front], met[front]
+        what[hit] = np.where(self.scene.cap[met[front]], CAP, SURFACE)
+        # One that meets a back went under a neighbour of its face, or was inside all the time.
+        t[back], what[back], at[back] = 0.0, np.where(own[back], SURFACE, BURIED), face[back]
+        return t, what, at
+
+    def normal(self, f: int, what: Ints, face: Ints, x: Floats, d: Floats) -> Floats:
+        """The gradient normal; that of the face on a cap, or if there is none."""
+        smooth = gradient_normal(self.scene, f, x)
+        geometric = np.flatnonzero((what == CAP) | ~smooth.any(axis=1))
+        smooth[geometric] = self.scene.facing[face[geometric]]
+        return smooth
+
+    def begin(self, own: Ints, x: Floats, normal: Floats) -> tuple[Floats, Ints]:
+        """Along the normal onto the mesh, or along that of the cell: see `kernels.settle`."""
+        x, face = x.copy(), np.full(len(x), NOWHERE)
+        for f in range(len(self.scene.start)):
+            mine = np.flatnonzero(own == f)
+            face[mine] = LOST
+            for along in (normal[mine], cell_normal(self.scene, f, x[mine])):
+                ask = (face[mine] == LOST) & along.any(axis=1)
+                x[mine[ask]], face[mine[ask]] = self.settle(f, x[mine[ask]], along[ask])
+        return x, face
+
+    def settle(self, f: int, x: Floats, normal: Floats) -> tuple[Floats, Ints]:
+        """Onto a front against the normal, or a back along it, within a cell, no cap: see `kernels.settle_along`."""
+        reach = 1.0 / (np.abs(normal) / self.scene.spacing[f]).max(axis=1, initial=0.0)
+        found, shift, face = np.full(len(x), np.inf), np.zeros(len(x)), np.full(len(x), LOST)
+        near = 2.0 * self.scene.off[f]
+        for along in (-1.0, 1.0):
+            t, met, front = self.first(f, x - along * near * normal, along * normal)
+            away = np.abs(t - near)
+            good = (met != NOWHERE) & (front == (along < 0)) & (t < near + reach) & (away < found)
+            good[good] = ~self.scene.cap[met[good]]
+            found[good], shift[good], face[good] = away[good], along * (t - near)[good], met[good]
+        return x + shift[:, None] * normal, face
+
+    def inside(self, f: int, level: Floats, x: Floats, normal: Floats) -> Bools:
+        """Whether a ray from beside the point along the normal sees a back."""
+        _, met, front = self.first(f, x + self.scene.off[f] * normal, normal)
+        return np.asarray((met != NOWHERE) & ~front)
+
+
+def near_enough(x: Floats, d: Floats) -> Floats:
+    """Distances (n,) at which rays from outside come near [-1, 1]³, 0 where they are; inf if never: `bvh.approach`."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        one, other = (-1.5 - x) / d, (1.5 - x) / d
+        still = d == 0
+        low = np.where(still, np.where(np.abs(x) > 1.5, np.inf, -np.inf), np.minimum(one, other)).max(axis=1)
+        high = np.where(still, np.inf, np.maximum(one, other)).min(axis=1)
+    start = np.where(low <= high, np.maximum(low, 0.0), np.inf)
+    return np.where(np.abs(x).max(axis=1, initial=0.0) <= 2.0, 0.0, np.where(high < 0, np.inf, start))
+
+
+_scenes: "weakref.WeakKeyDictionary[LevelMesh, Any]" = weakref.WeakKeyDictionary()
+
+
+def embree_scene(mesh: LevelMesh) -> Any:
+    """Embree's scene of a mesh, in the space of its tree; kept as long as the mesh is."""
+    from embreex.mesh_construction import TriangleMesh
+    from embreex.rtcore_scene import EmbreeScene
+
+    if mesh not in _scenes:
+        scene = EmbreeScene(robust=True)  # no ray gets between two faces
+        vertices = ((mesh.vertices - mesh.tree.centre) * mesh.tree.scale).astype(np.float32)
+        TriangleMesh(scene, vertices, mesh.faces)
+        scene.run(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32))  # builds the tree
+        _scenes[mesh] = scene
+    return _scenes[mesh]
+
+
+def by_embree(scene: Any, meshes: list[LevelMesh]) -> Cast:
+    """How embreex casts rays."""
+    built = [embree_scene(mesh) if len(mesh.faces) else None for mesh in meshes]
+
+    def cast(f: int, x: Floats, d: Floats) -> tuple[Floats, Ints]:
+        tree = built[f]
+        if tree is None or not len(x):
+            return np.full(len(x), np.inf), np.full(len(x), -1)
+        x, d = (x - scene.centre[f]) * scene.scale[f], d * scene.scale[f]
+        start = near_enough(x, d)
+        come = np.isfinite(start)
+        t, face = np.full(len(x), np.inf), np.full(len(x), -1)
+        origin = (x[come] + start[come, None] * d[come]).astype(np.float32)
+        hit = tree.run(origin, d[come].astype(np.float32), output=1)
+        face[come] = hit["primID"]
+        t[come] = np.where(hit["primID"] < 0, np.inf, hit["tfar"].astype(float) + start[come])
+        return t, face
+
+    return cast
+
+
+@dataclass(frozen=True)
+class Embree:
+    """Paths over the meshes of the level sets, cast by Intel's Embree.
+
+    Parameters
+    ----------
+    threads : int
+        Threads that share the queries; 0 takes one for each processor. The answer does not depend on it.
+    """
+
+    name: ClassVar[str] = "embree"
+    geometry: ClassVar[Literal["mesh", "levelset", "both"]] = "mesh"
+    threads: int = 0
+
+    def __post_init__(self) -> None:
+        if cure := self.available():
+            raise BadInput(f"the backend 'embree' needs the package embreex, which is not installed; run: {cure}")
+        if self.threads < 0:
+            raise BadInput(f"{self.threads} threads were asked for; expected a positive number, or 0 for all")
+
+    @classmethod
+    def available(cls) -> str | None:
+        """None, or what would make it so."""
+        return None if importlib.util.find_spec("embreex") else "pip install embreex"
+
+    def solve(self, scene: Scene, queries: Queries, *, paths: range, bounces: int, seed: int) -> Samples:
+        """Trace paths from every query: see `illumgrid.stages.Backend`."""
+        check_request(paths, bounces)
+        n = len(queries)
+        mean, m2 = np.zeros((n, 3), np.float32), np.zeros((n, 3), np.float32)
+        count = np.zeros(n, np.int32)
+        if n and len(paths):
+            point, normal, level = in_frame(scene, queries)
+            with np.errstate(over="ignore"):
+                key = stream(np.uint64(seed), queries.id)
+
+            def chunk(surfaces: Casting, rows: Ints) -> None:
+                own = queries.target[rows].astype(np.int64)
+                light, spread, good = answer(
+                    surfaces, key[rows], level[rows], own, point[rows], normal[rows], paths, bounces
+                )
+                mean[rows], m2[rows], count[rows] = light, spread, np.where(good, len(paths), 0)
+
+            share(chunk, self._pieces(scene, queries.level), self.threads or cores())
+        return Samples(queries, mean, m2, count)
+
+    def _pieces(self, scene: Scene, level: Floats) -> Iterator[tuple[Casting, NDArray[np.int64]]]:
+        """What the rays meet, and queries for which it does."""
+        for row, members in row_groups(scene, level):
+            layout = meshed(scene, row)
+            meshes = [level_mesh(field, c) for field, c in zip(scene.fields, row.tolist())]
+            surfaces = Casting(layout, by_embree(layout, meshes))
+            for i in range(0, len(members), 1024):
+                yield surfaces, members[i : i + 1024]
+
+
+@hookimpl
+def register_backends() -> list[type[Backend]]:
+    """Name this file's stage to the registry, as a plugin does."""
+    return [Embree]
