@@ -28,7 +28,9 @@ class Bricks(NamedTuple):
 
     steps: NDArray[np.float32]  # (RANKS,) ascending, filled up with inf
     shape: tuple[int, int, int]  # bricks along each axis
-    bytes: Bytes  # (bricks, 128): 64 cells, then 8 octants by 8 reaches
+    records: Bytes  # (bricks, 128) of each brick, in C order: first its cells, then its cubes towards the 8 octants
+    # cells: (BRICK³) in C order, the rank of the largest value at a cell's corners
+    # cubes: (8, len(REACH)) the largest rank in the cube of so many bricks that begins here; octants in C order, 1 is up
 
 
 def lay_bricks(values: NDArray[np.float32]) -> Bricks:
@@ -38,20 +40,22 @@ def lay_bricks(values: NDArray[np.float32]) -> Bricks:
     for axis in range(3):
         line = np.moveaxis(ranks, axis, 0)
         ranks = np.moveaxis(np.maximum(line[:-1], line[1:]), 0, axis)
-    shape = tuple(-(-n // BRICK) for n in ranks.shape)
+    nx, ny, nz = (-(-n // BRICK) for n in ranks.shape)
+    shape = nx, ny, nz
     ranks = np.pad(ranks, [(0, m * BRICK - n) for m, n in zip(shape, ranks.shape)])
     split = ranks.reshape(shape[0], BRICK, shape[1], BRICK, shape[2], BRICK)
     cells = np.ascontiguousarray(split.transpose(0, 2, 4, 1, 3, 5)).reshape(-1, BRICK**3)
-    cubes = _cubes(cells.max(axis=1).reshape(shape))
-    return Bricks(steps, shape, np.concatenate([cells, cubes.transpose(1, 0, 2).reshape(len(cells), -1)], axis=1))
+    records = _aligned(len(cells), BRICK**3 + 8 * len(REACH))
+    records[:, : BRICK**3] = cells
+    records[:, BRICK**3 :] = _cubes(cells.max(axis=1).reshape(shape)).reshape(len(cells), -1)
+    return Bricks(steps, shape, records)
 
-def aligned(x):
-    raw=np.empty(x.size+64,np.uint8)
-    o=-raw.ctypes.data%64
-    out=raw[o:o+x.size]
-    out[:]=x.reshape(-1)
-    return out
 
+def _aligned(bricks: int, size: int) -> Bytes:
+    """Room for records that lie on whole cache lines."""
+    room = np.empty(bricks * size + 64, np.uint8)
+    first = -room.ctypes.data % 64
+    return room[first : first + bricks * size].reshape(bricks, size)
 
 
 def _steps(values: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -71,8 +75,8 @@ def _steps(values: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _cubes(largest: Bytes) -> Bytes:
-    """Largest rank in the cubes of REACH bricks that begin at each brick, (8, bricks, len(REACH))."""
-    out = np.zeros((8, largest.size, len(REACH)), np.uint8)
+    """Largest rank in the cubes of REACH bricks that begin at each brick, (bricks, 8, len(REACH))."""
+    out = np.zeros((largest.size, 8, len(REACH)), np.uint8)
     for octant in range(8):
         # Seen along the octant every axis goes up.
         turn = tuple(slice(None, None, 1 if octant >> (2 - axis) & 1 else -1) for axis in range(3))
@@ -81,7 +85,7 @@ def _cubes(largest: Bytes) -> Bytes:
         for k, reach in enumerate(REACH):
             cube = _reaching(cube, side, reach)
             side = reach
-            out[octant, :, k] = cube[turn].reshape(-1)
+            out[:, octant, k] = cube[turn].reshape(-1)
     return out
 
 

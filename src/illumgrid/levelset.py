@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from illumgrid.bricks import Bricks, lay_bricks, aligned
+from illumgrid.bricks import Bricks, lay_bricks
 from illumgrid.errors import BadInput
 from illumgrid.samples import Queries
 from illumgrid.scene import Scene
@@ -90,8 +90,8 @@ class Marchable(NamedTuple):
     shape: NDArray[np.int64]  # (F, 3) voxels
     origin: Floats  # (F, 3) frame position of voxel 0
     spacing: Floats  # (F, 3)
-    steps: NDArray[np.float32]  # (F, RANKS): the bricks of all fields as in `illumgrid.bricks`, one after the other
-    bricks: NDArray[np.uint8]
+    steps: NDArray[np.float32]  # (F, RANKS) as in `illumgrid.bricks`
+    bricks: NDArray[np.uint8]  # 128 bytes a brick, all fields, one after the other
     brick_start: NDArray[np.int64]  # (F,) how many bricks come before
     brick_shape: NDArray[np.int64]  # (F, 3)
     albedo: Floats  # (F + Q, 3): fields, then quads
@@ -125,6 +125,7 @@ def marchable(scene: Scene) -> Marchable:
     parts = [turned(f.volume, f.inside) for f in scene.fields]
     values = [p[0].reshape(-1) for p in parts]
     bricks = [p[1] for p in parts]
+    records = [b.records.reshape(-1) for b in bricks]
     materials = [f.material for f in scene.fields] + [q.material for q in scene.quads]
     return Marchable(
         values=values[0] if len(parts) == 1 else np.concatenate(values),
@@ -133,8 +134,8 @@ def marchable(scene: Scene) -> Marchable:
         origin=scene.to_frame([f.volume.origin for f in scene.fields]),
         spacing=np.array([f.volume.spacing for f in scene.fields]),
         steps=np.array([b.steps for b in bricks]),
-        bricks=aligned(bricks[0].bytes) if len(parts) == 1 else np.concatenate([b.bytes for b in bricks]).reshape(-1),
-        brick_start=np.cumsum([0, *(len(b.bytes) for b in bricks)], dtype=np.int64)[:-1],
+        bricks=records[0] if len(parts) == 1 else np.concatenate(records),
+        brick_start=np.cumsum([0, *(len(b.records) for b in bricks)], dtype=np.int64)[:-1],
         brick_shape=np.array([b.shape for b in bricks], dtype=np.int64),
         albedo=np.array([material.albedo for material in materials]),
         emission=np.array([material.emission for material in materials]),

@@ -1,7 +1,7 @@
 """The compiled call tree: marching rays through trilinear fields, and walking light paths.
 
-All of it lives in this one file because Numba's disk cache does not see edits elsewhere; its only import is the frozen
-`rng`. Kernels are serial, release the GIL and depend on nothing but their arguments; threads are the caller's business.
+All of it lives in this one file because Numba's disk cache does not see edits elsewhere; its only imports are `lanes`,
+which `cached` names, and the frozen `rng`. Kernels are serial, release the GIL and depend on nothing but their arguments; threads are the caller's business.
 
 A field comes as {v >= level}: `illumgrid.levelset.Marchable` has turned it so. Index coordinates of field f are
 (x - origin[f]) / spacing[f] for x in the frame of the scene; t is world distance throughout.
@@ -27,8 +27,22 @@ inlined = cached(lanes, _nrt=False, forceinline=True)
 MISS, SURFACE, CAP, BURIED, QUAD = 0, 1, 2, 3, 4  # a ray meets nothing, a level set, a cap, a solid's inside, a quad
 BRICK_SHIFT = 2  # bricks of 4 cells a side, as in illumgrid.bricks
 REACH = (1, 1, 2, 3, 4, 6, 8, 16, 1 << 20)  # bricks to leap, by how many cubes are empty, as in illumgrid.bricks
+ONE = np.uint64(1)
 ON_A_VOXEL = 1e-7  # as in illumgrid.volume
 ON_A_WALL = 1e-10  # a wall reaches this share of its size farther, so that walls joined at an edge leave no gap
+
+
+def _between(axis):
+    """Cells of a brick, as bits, from `low` to `high` along an axis, for 4 low + high."""
+    cell = np.arange(64) >> (4 - 2 * axis) & 3
+    return tuple(
+        np.uint64(sum(1 << int(bit) for bit in np.flatnonzero((low <= cell) & (cell <= high))))
+        for low in range(4)
+        for high in range(4)
+    )
+
+
+BETWEEN = _between(0) + _between(1) + _between(2)
 
 
 @inlined
@@ -143,15 +157,6 @@ def cubic(values, corner, step_x, step_y, level, ex, ey, ez, dx, dy, dz):
     return b0 + z0 * ez, b1 + z1 * ez + z0 * dz, b2 + z2 * ez + z1 * dz, z2 * dz
 
 
-def _between(axis):
-    cell = np.arange(64) >> (4 - 2 * axis) & 3
-    return tuple(
-        np.uint64(sum(1 << int(b) for b in np.flatnonzero((cell >= lo) & (cell <= hi)))) for lo in range(4) for hi in range(4)
-    )
-
-BETWEEN = _between(0) + _between(1) + _between(2)
-ONE = np.uint64(1)
-
 @inlined
 def rank_of(steps, level):
     """Rank of a level among the steps of a field: see `illumgrid.bricks`."""
@@ -175,8 +180,9 @@ def follow(u, t, d, low, high):
 def march(scene, f, level, ux, uy, uz, dx, dy, dz, on_surface, limit):
     """First meeting of a ray with the solid of field f, in index coordinates u + t d.
 
-    The ray leaps from brick to brick over the largest cube of bricks ahead that ranks below the level, and in a brick that
-    does not it goes from cell to cell (Amanatides & Woo 1987).
+    Bytes are compared first: see `illumgrid.bricks`. The ray leaps over the largest cube of bricks ahead that ranks below
+    the level; in a brick that does not, it goes from cell to cell (Amanatides & Woo 1987) if any of the cells between its
+    two ends ranks high enough, and asks the cubic in those only.
     `on_surface`: the ray starts on the level set itself, outside. Returns (t, what, face), face the axis of a cap.
     """
     last_x, last_y, last_z = scene.shape[f, 0] - 1, scene.shape[f, 1] - 1, scene.shape[f, 2] - 1
@@ -186,19 +192,20 @@ def march(scene, f, level, ux, uy, uz, dx, dy, dz, on_surface, limit):
     kx = -ux * ix if dx != 0.0 else np.inf
     ky = -uy * iy if dy != 0.0 else np.inf
     kz = -uz * iz if dz != 0.0 else np.inf
-    t, t_out, face = 0.0, limit, -1
+    t, face = 0.0, -1
     if not (0.0 <= ux <= last_x and 0.0 <= uy <= last_y and 0.0 <= uz <= last_z):
-        # From outside: the last of the three planes that it comes through.
-        for axis in range(3):
-            u, i, k, last = (ux, ix, kx, last_x) if axis == 0 else ((uy, iy, ky, last_y) if axis == 1 else (uz, iz, kz, last_z))
-            if i == 0.0:
-                if u < 0.0 or u > last:
-                    return np.inf, MISS, -1
-            else:
-                near = min(k, last * i + k)
-                if near > t:
-                    t, face = near, axis
-    t_out = min(t_out, max(kx, last_x * ix + kx), max(ky, last_y * iy + ky), max(kz, last_z * iz + kz))
+        # From outside: it enters through the last of three planes.
+        if (ix == 0.0 and not 0.0 <= ux <= last_x) or (iy == 0.0 and not 0.0 <= uy <= last_y):
+            return np.inf, MISS, -1
+        if iz == 0.0 and not 0.0 <= uz <= last_z:
+            return np.inf, MISS, -1
+        if ix != 0.0 and min(kx, last_x * ix + kx) > t:
+            t, face = min(kx, last_x * ix + kx), 0
+        if iy != 0.0 and min(ky, last_y * iy + ky) > t:
+            t, face = min(ky, last_y * iy + ky), 1
+        if iz != 0.0 and min(kz, last_z * iz + kz) > t:
+            t, face = min(kz, last_z * iz + kz), 2
+    t_out = min(limit, max(kx, last_x * ix + kx), max(ky, last_y * iy + ky), max(kz, last_z * iz + kz))
     if t > t_out:
         return np.inf, MISS, -1
     px = min(max(ux + t * dx, 0.0), last_x) if face != 0 else (0.0 if dx > 0.0 else 1.0 * last_x)
@@ -236,7 +243,11 @@ def march(scene, f, level, ux, uy, uz, dx, dy, dz, on_surface, limit):
             t_brick = min(tx, ty, tz)
             if empty == 0:
                 low_x, low_y, low_z = bx << BRICK_SHIFT, by << BRICK_SHIFT, bz << BRICK_SHIFT
-                high_x, high_y, high_z = min(low_x + 4, last_x) - 1, min(low_y + 4, last_y) - 1, min(low_z + 4, last_z) - 1
+                high_x, high_y, high_z = (
+                    min(low_x + 4, last_x) - 1,
+                    min(low_y + 4, last_y) - 1,
+                    min(low_z + 4, last_z) - 1,
+                )
                 if started:
                     cx = follow(ux, t, dx, low_x, high_x)
                     cy = follow(uy, t, dy, low_y, high_y)

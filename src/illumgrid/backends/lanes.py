@@ -321,7 +321,5 @@ compiles(at_least, types.uint64, types.intp, types.intp, types.intp)(
     lambda builder, base, i, rank: _compare(builder, base, i, rank, 64, ">=")
 )
 compiles(count_below, types.intp, types.intp, types.intp, types.intp)(
-    lambda builder, base, i, rank: builder.zext(
-        builder.ctpop(_compare(builder, base, i, rank, 8, "<")), ir.IntType(64)
-    )
+    lambda builder, base, i, rank: builder.zext(builder.ctpop(_compare(builder, base, i, rank, 8, "<")), ir.IntType(64))
 )
