@@ -30,7 +30,7 @@ class Bricks(NamedTuple):
     shape: tuple[int, int, int]  # bricks along each axis
     records: Bytes  # (bricks, 128) of each brick, in C order: first its cells, then its cubes towards the 8 octants
     # cells: (BRICK³) in C order, the rank of the largest value at a cell's corners
-    # cubes: (8, len(REACH)) the largest rank in the cube of so many bricks that begins here; octants in C order, 1 is up
+    # cubes: (8, len(REACH)) the largest rank in the cube of so many bricks from here on; octants in C order, up is 1
 
 
 def lay_bricks(values: NDArray[np.float32]) -> Bricks:

@@ -1,7 +1,8 @@
 """The compiled call tree: marching rays through trilinear fields, and walking light paths.
 
 All of it lives in this one file because Numba's disk cache does not see edits elsewhere; its only imports are `lanes`,
-which `cached` names, and the frozen `rng`. Kernels are serial, release the GIL and depend on nothing but their arguments; threads are the caller's business.
+which `cached` names, and the frozen `rng`. Kernels are serial, release the GIL and depend on nothing but their arguments;
+threads are the caller's business.
 
 A field comes as {v >= level}: `illumgrid.levelset.Marchable` has turned it so. Index coordinates of field f are
 (x - origin[f]) / spacing[f] for x in the frame of the scene; t is world distance throughout.
@@ -180,9 +181,9 @@ def follow(u, t, d, low, high):
 def march(scene, f, level, ux, uy, uz, dx, dy, dz, on_surface, limit):
     """First meeting of a ray with the solid of field f, in index coordinates u + t d.
 
-    Bytes are compared first: see `illumgrid.bricks`. The ray leaps over the largest cube of bricks ahead that ranks below
-    the level; in a brick that does not, it goes from cell to cell (Amanatides & Woo 1987) if any of the cells between its
-    two ends ranks high enough, and asks the cubic in those only.
+    Bytes are compared first: see `illumgrid.bricks`. The ray leaps over the largest cube of bricks ahead that ranks
+    below the level. A brick that does not is crossed at once too if no cell between the ray's two ends in it ranks high
+    enough; else the ray goes from cell to cell (Amanatides & Woo 1987) and asks the cubic in such cells only.
     `on_surface`: the ray starts on the level set itself, outside. Returns (t, what, face), face the axis of a cap.
     """
     last_x, last_y, last_z = scene.shape[f, 0] - 1, scene.shape[f, 1] - 1, scene.shape[f, 2] - 1
