@@ -1,8 +1,8 @@
 """The compiled call tree: marching rays through trilinear fields, and walking light paths.
 
 All of it lives in this one file because Numba's disk cache does not see edits elsewhere; its only imports are `lanes`,
-which `cached` names, and the frozen `rng`. Kernels are serial, release the GIL and depend on nothing but their arguments;
-threads are the caller's business.
+which `cached` names, and the frozen `rng`. Kernels are serial, release the GIL and depend on nothing but their
+arguments; threads are the caller's business.
 
 A field comes as {v >= level}: `illumgrid.levelset.Marchable` has turned it so. Index coordinates of field f are
 (x - origin[f]) / spacing[f] for x in the frame of the scene; t is world distance throughout.
