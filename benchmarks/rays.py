@@ -28,7 +28,7 @@ from scipy.ndimage import gaussian_filter
 
 from illumgrid import Queries, Scene, Volume, isosurface
 from illumgrid.backends import bvh
-from illumgrid.backends.kernels import cast_rays
+from illumgrid.backends.kernels import nearest_hit
 from illumgrid.levelset import in_frame, marchable
 
 RAYS, ROUNDS = 200_000, 9
@@ -99,6 +99,14 @@ def embree_scene(mesh):
     return embree
 
 
+@numba.njit(nogil=True, error_model="numpy", _nrt=False)
+def march_rays(fields, level, origin, direction, on, t):
+    """Distances through the field, without normals: nor do the others give any."""
+    for i in range(len(origin)):
+        x, d = (origin[i, 0], origin[i, 1], origin[i, 2]), (direction[i, 0], direction[i, 1], direction[i, 2])
+        t[i] = nearest_hit(fields, level, x, d, on, False)[0]
+
+
 def contenders(fields, tree, embree, level, on, origin, direction):
     """How each casts these rays, and the distances it fills; `on` is 0 where rays leave the surface, else -1."""
     n = len(origin)
@@ -110,8 +118,7 @@ def contenders(fields, tree, embree, level, on, origin, direction):
             along_mesh, np.zeros(n, np.int64), np.zeros((n, 2), np.float32),
         ),
         "marching": partial(
-            cast_rays, fields, np.array([level]), origin, direction, on,
-            along_field, np.zeros(n, np.int64), np.zeros(n, np.int64), np.zeros((n, 3)),
+            march_rays, fields, np.array([level]), origin, direction, on, along_field,
         ),
     }  # fmt: skip
     if embree:

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from illumgrid.bricks import Bricks, lay_bricks
 from illumgrid.errors import BadInput
 from illumgrid.samples import Queries
 from illumgrid.scene import Scene
@@ -13,9 +14,6 @@ from illumgrid.volume import Floats, Side, Volume, index_to_world
 
 if TYPE_CHECKING:
     import trimesh
-
-BRICK = 4
-"""Cells along the side of a brick."""
 
 
 def off_the_data(volume: Volume, isovalue: float, inside: Side) -> float:
@@ -93,7 +91,7 @@ class Marchable(NamedTuple):
     """All fields of a scene as flat arrays that a compiled kernel marches through, in the frame of the scene.
 
     Every field is turned so that its solid is {v >= level}: for `inside` "below" v = -h and levels change sign too.
-    The bricks serve every isovalue: a brick whose largest v is below the level is empty.
+    Their bricks serve every isovalue.
     """
 
     values: NDArray[np.float32]  # all fields, one after the other, C order
@@ -101,8 +99,9 @@ class Marchable(NamedTuple):
     shape: NDArray[np.int64]  # (F, 3) voxels
     origin: Floats  # (F, 3) frame position of voxel 0
     spacing: Floats  # (F, 3)
-    bricks: NDArray[np.float32]  # largest v of each brick, all fields, C order
-    brick_start: NDArray[np.int64]  # (F,)
+    steps: NDArray[np.float32]  # (F, RANKS) as in `illumgrid.bricks`
+    bricks: NDArray[np.uint8]  # 128 bytes a brick, all fields, one after the other
+    brick_start: NDArray[np.int64]  # (F,) how many bricks come before
     brick_shape: NDArray[np.int64]  # (F, 3)
     albedo: Floats  # (F + Q, 3): fields, then quads
     emission: Floats  # (F + Q, 3)
@@ -117,28 +116,16 @@ class Marchable(NamedTuple):
     lamp_density: Floats  # (Q,) probability to choose a point of the quad, per area; 0 if it does not emit
 
 
-_turned: "weakref.WeakKeyDictionary[Volume, dict[Side, tuple[NDArray[np.float32], NDArray[np.float32]]]]"
+_turned: "weakref.WeakKeyDictionary[Volume, dict[Side, tuple[NDArray[np.float32], Bricks]]]"
 _turned = weakref.WeakKeyDictionary()
 
 
-def _brick_maxima(values: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Largest value over the (BRICK + 1)³ voxels of each brick of BRICK³ cells."""
-    for axis in range(3):
-        line = np.moveaxis(values, axis, 0)
-        starts = np.arange(0, len(line) - 1, BRICK)
-        inner = np.maximum.reduceat(line, starts, axis=0)
-        # reduceat ends before the next brick's first voxel, which is this brick's last one too.
-        last = line[np.minimum(starts + BRICK, len(line) - 1)]
-        values = np.moveaxis(np.maximum(inner, last), 0, axis)
-    return np.ascontiguousarray(values)
-
-
-def turned(volume: Volume, inside: Side) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Values with the solid upwards, and their brick maxima; built once for each volume and side."""
+def turned(volume: Volume, inside: Side) -> tuple[NDArray[np.float32], Bricks]:
+    """Values with the solid upwards, and their bricks; built once for each volume and side."""
     known = _turned.setdefault(volume, {})
     if inside not in known:
         values = volume.values if inside == "above" else -volume.values
-        known[inside] = values, _brick_maxima(values)
+        known[inside] = values, lay_bricks(values)
     return known[inside]
 
 
@@ -146,7 +133,8 @@ def marchable(scene: Scene) -> Marchable:
     """Lay out a scene for marching; one field costs no copy."""
     parts = [turned(f.volume, f.inside) for f in scene.fields]
     values = [p[0].reshape(-1) for p in parts]
-    bricks = [p[1].reshape(-1) for p in parts]
+    bricks = [p[1] for p in parts]
+    records = [b.records.reshape(-1) for b in bricks]
     materials = [f.material for f in scene.fields] + [q.material for q in scene.quads]
     return Marchable(
         values=values[0] if len(parts) == 1 else np.concatenate(values),
@@ -154,9 +142,10 @@ def marchable(scene: Scene) -> Marchable:
         shape=np.array([p[0].shape for p in parts], dtype=np.int64),
         origin=scene.to_frame([f.volume.origin for f in scene.fields]),
         spacing=np.array([f.volume.spacing for f in scene.fields]),
-        bricks=bricks[0] if len(parts) == 1 else np.concatenate(bricks),
-        brick_start=np.cumsum([0, *(len(b) for b in bricks)], dtype=np.int64)[:-1],
-        brick_shape=np.array([p[1].shape for p in parts], dtype=np.int64),
+        steps=np.array([b.steps for b in bricks]),
+        bricks=records[0] if len(parts) == 1 else np.concatenate(records),
+        brick_start=np.cumsum([0, *(len(b.records) for b in bricks)], dtype=np.int64)[:-1],
+        brick_shape=np.array([b.shape for b in bricks], dtype=np.int64),
         albedo=np.array([material.albedo for material in materials]),
         emission=np.array([material.emission for material in materials]),
         background=np.array(scene.background),

@@ -19,7 +19,7 @@ from numba.extending import overload, register_jitable
 
 from illumgrid.backends import bvh, lanes
 from illumgrid.backends.bvh import View, cast
-from illumgrid.backends.lanes import address, cached
+from illumgrid.backends.lanes import address, at_least, cached, count_below
 from illumgrid.levelset import Marchable
 from illumgrid.rng import draw, draw_pair, mix, net_size, partner, pascal, reverse, stream, upward
 
@@ -30,9 +30,13 @@ for _function in (mix, stream, draw, reverse, pascal, upward, draw_pair, net_siz
 # Nor Numba's reference counts: nothing is allocated here, the caller keeps the arrays alive, and the atomic counts of a
 # scene handed from function to function cost a third of the time.
 jit = cached(lanes, bvh, _nrt=False)
+# A call that hands a scene on moves 200 words: what every ray calls is inlined.
+inlined = cached(lanes, bvh, _nrt=False, forceinline=True)
 
 MISS, SURFACE, CAP, BURIED, QUAD = 0, 1, 2, 3, 4  # a ray meets nothing, a level set, a cap, a solid's inside, a quad
-BRICK_SHIFT = 2  # bricks of 4 cells a side, as in levelset.BRICK
+BRICK_SHIFT = 2  # bricks of 4 cells a side, as in illumgrid.bricks
+REACH = (1, 1, 2, 3, 4, 6, 8, 16, 1 << 20)  # bricks to leap, by how many cubes are empty, as in illumgrid.bricks
+ONE = np.uint64(1)
 ON_A_VOXEL = 1e-7  # as in illumgrid.volume
 ON_A_WALL = 1e-10  # a wall reaches this share of its size farther, so that walls joined at an edge leave no gap
 NOWHERE, LOST = -1, -2  # instead of a face: a surface that needs none; a query whose mesh is out of reach
@@ -52,28 +56,41 @@ def either(marched: Any, meshed: Any) -> Any:
     return ask
 
 
-@jit
+def _between(axis: int) -> tuple[np.uint64, ...]:
+    """Cells of a brick, as bits, from `low` to `high` along an axis, for 4 low + high."""
+    cell = np.arange(64) >> (4 - 2 * axis) & 3
+    return tuple(
+        np.uint64(sum(1 << int(bit) for bit in np.flatnonzero((low <= cell) & (cell <= high))))
+        for low in range(4)
+        for high in range(4)
+    )
+
+
+BETWEEN = _between(0) + _between(1) + _between(2)
+
+
+@inlined
 def first_cell(u, d, last):
     """Cell along one axis that a ray enters at index coordinate u; outside 0 .. last - 1 it has left the field."""
-    cell = int(np.floor(u))
+    cell = int(u)
     if u == cell and (d < 0.0 or (d == 0.0 and cell == last)):
         cell -= 1
     return cell
 
 
-@jit
+@inlined
 def snap(u):
     """Index coordinate of a node that lies on a voxel."""
     nearest = np.round(u)
     return nearest if abs(u - nearest) < ON_A_VOXEL else u
 
 
-@jit
+@inlined
 def first_root(q0, q1, q2, q3, end):
     """Smallest t in [0, end] at which q0 + q1 t + q2 t² + q3 t³ reaches 0 from q0 < 0; inf if none."""
     # On [0, 1]: the Bernstein coefficients bound the cubic, and most cells end here.
     a, b, c = q1 * end, q2 * end * end, q3 * end * end * end
-    if q0 + a / 3.0 < 0.0 and q0 + (2.0 * a + b) / 3.0 < 0.0 and q0 + a + b + c < 0.0:
+    if 3.0 * q0 + a < 0.0 and 3.0 * q0 + 2.0 * a + b < 0.0 and q0 + a + b + c < 0.0:
         return np.inf
     # The roots of the derivative part [0, 1] into monotone pieces.
     low, high = 2.0, 2.0
@@ -83,14 +100,16 @@ def first_root(q0, q1, q2, q3, end):
         low, high = q / (3.0 * c), a / q
         if low > high:
             low, high = high, low
-    left = 0.0
+    left, below = 0.0, q0
     for piece in range(3):
         right = low if piece == 0 else (high if piece == 1 else 1.0)
         if piece < 2 and not (left < right < 1.0):
             continue
-        if q0 + right * (a + right * (b + right * c)) >= 0.0:
-            # One root in [left, right], on a rising piece: Newton steps, bisection where they leave the bracket.
-            s = 0.5 * (left + right)
+        above = q0 + right * (a + right * (b + right * c))
+        if above >= 0.0:
+            # One root in [left, right], on a rising piece: Newton steps from the chord, bisection where they leave the
+            # bracket. A step of 1e-10 leaves an error of its square; at a double root it halves the error.
+            s = left - below * (right - left) / (above - below)
             for _ in range(60):
                 value = q0 + s * (a + s * (b + s * c))
                 if value >= 0.0:
@@ -98,17 +117,17 @@ def first_root(q0, q1, q2, q3, end):
                 else:
                     left = s
                 after = s - value / (a + s * (2.0 * b + 3.0 * c * s))
-                if not (left < after < right):
+                if not (left <= after <= right):
                     after = 0.5 * (left + right)
-                if abs(after - s) < 1e-14:
+                step, s = abs(after - s), after
+                if step < 1e-10:
                     break
-                s = after
             return s * end
-        left = right
+        left, below = right, above
     return np.inf
 
 
-@jit
+@inlined
 def next_root(q1, q2, q3, end):
     """Smallest t in [0, end] at which t (q1 + q2 t + q3 t²) reaches 0 from below, its root at 0 divided out.
 
@@ -136,7 +155,7 @@ def next_root(q1, q2, q3, end):
     return best * end
 
 
-@jit
+@inlined
 def cubic(values, corner, step_x, step_y, level, ex, ey, ez, dx, dy, dz):
     """Coefficients of v - level along a ray through a trilinear cell, from its entry e in [0, 1]³.
 
@@ -162,40 +181,55 @@ def cubic(values, corner, step_x, step_y, level, ex, ey, ez, dx, dy, dz):
     return b0 + z0 * ez, b1 + z1 * ez + z0 * dz, b2 + z2 * ez + z1 * dz, z2 * dz
 
 
-@jit
-def enter(u, d, last, t_in, t_out, axis, face):
-    """Clip a ray to 0 <= u + t d <= last along one axis."""
-    if d == 0.0:
-        if u < 0.0 or u > last:
-            t_out = -np.inf
-    else:
-        near, far = -u / d, (last - u) / d
-        if near > far:
-            near, far = far, near
-        if near > t_in:
-            t_in, face = near, axis
-        t_out = min(t_out, far)
-    return t_in, t_out, face
+@inlined
+def rank_of(steps, level):
+    """Rank of a level among the steps of a field: see `illumgrid.bricks`."""
+    low, high = 0, steps.shape[0]
+    while low < high:
+        middle = (low + high) >> 1
+        if steps[middle] <= level:
+            low = middle + 1
+        else:
+            high = middle
+    return low
 
 
-@jit
+@inlined
 def follow(u, t, d, low, high):
     """Cell, of those from low to high, at distance t along one axis."""
-    return min(max(int(np.floor(u + t * d)), low), high)
+    return min(max(int(u + t * d), low), high)
 
 
-@jit
+@inlined
 def march(scene, f, level, ux, uy, uz, dx, dy, dz, on_surface, limit):
     """First meeting of a ray with the solid of field f, in index coordinates u + t d.
 
-    Two-level traversal (Amanatides & Woo 1987) over bricks and cells; a brick or cell all below the level is empty.
+    Bytes are compared first: see `illumgrid.bricks`. The ray leaps over the largest cube of bricks ahead that ranks
+    below the level. A brick that does not is crossed at once too if no cell between the ray's two ends in it ranks high
+    enough; else the ray goes from cell to cell (Amanatides & Woo 1987) and asks the cubic in such cells only.
     `on_surface`: the ray starts on the level set itself, outside. Returns (t, what, face), face the axis of a cap.
     """
     last_x, last_y, last_z = scene.shape[f, 0] - 1, scene.shape[f, 1] - 1, scene.shape[f, 2] - 1
-    t, t_out, face = 0.0, limit, -1
-    t, t_out, face = enter(ux, dx, last_x, t, t_out, 0, face)
-    t, t_out, face = enter(uy, dy, last_y, t, t_out, 1, face)
-    t, t_out, face = enter(uz, dz, last_z, t, t_out, 2, face)
+    # A plane at index coordinate p is met at t = p i + k; a ray parallel to it never does: i = 0, k = inf.
+    # Bricks and cells compute it alike, so that a brick's last cell ends exactly where the brick does.
+    ix, iy, iz = 1.0 / dx if dx != 0.0 else 0.0, 1.0 / dy if dy != 0.0 else 0.0, 1.0 / dz if dz != 0.0 else 0.0
+    kx = -ux * ix if dx != 0.0 else np.inf
+    ky = -uy * iy if dy != 0.0 else np.inf
+    kz = -uz * iz if dz != 0.0 else np.inf
+    t, face = 0.0, -1
+    if not (0.0 <= ux <= last_x and 0.0 <= uy <= last_y and 0.0 <= uz <= last_z):
+        # From outside: it enters through the last of three planes.
+        if (ix == 0.0 and not 0.0 <= ux <= last_x) or (iy == 0.0 and not 0.0 <= uy <= last_y):
+            return np.inf, MISS, -1
+        if iz == 0.0 and not 0.0 <= uz <= last_z:
+            return np.inf, MISS, -1
+        if ix != 0.0 and min(kx, last_x * ix + kx) > t:
+            t, face = min(kx, last_x * ix + kx), 0
+        if iy != 0.0 and min(ky, last_y * iy + ky) > t:
+            t, face = min(ky, last_y * iy + ky), 1
+        if iz != 0.0 and min(kz, last_z * iz + kz) > t:
+            t, face = min(kz, last_z * iz + kz), 2
+    t_out = min(limit, max(kx, last_x * ix + kx), max(ky, last_y * iy + ky), max(kz, last_z * iz + kz))
     if t > t_out:
         return np.inf, MISS, -1
     px = min(max(ux + t * dx, 0.0), last_x) if face != 0 else (0.0 if dx > 0.0 else 1.0 * last_x)
@@ -212,80 +246,123 @@ def march(scene, f, level, ux, uy, uz, dx, dy, dz, on_surface, limit):
         if q0 >= 0.0:
             return t, (CAP if face >= 0 else BURIED), face
 
-    brick_y = scene.brick_shape[f, 2]
-    brick_x = brick_y * scene.brick_shape[f, 1]
-    brick_start = scene.brick_start[f]
-    # A plane at index coordinate p is met at t = p i + k; a ray parallel to it never does: i = 0, k = inf.
-    # Bricks and cells compute it alike, so that a brick's last cell ends exactly where the brick does.
-    ix, kx = (1.0 / dx, -ux / dx) if dx != 0.0 else (0.0, np.inf)
-    iy, ky = (1.0 / dy, -uy / dy) if dy != 0.0 else (0.0, np.inf)
-    iz, kz = (1.0 / dz, -uz / dz) if dz != 0.0 else (0.0, np.inf)
     ahead_x, ahead_y, ahead_z = int(dx > 0.0), int(dy > 0.0), int(dz > 0.0)
     toward_x, toward_y, toward_z = 2 * ahead_x - 1, 2 * ahead_y - 1, 2 * ahead_z - 1
+    along_x, along_y, along_z = 1.0 * toward_x, 1.0 * toward_y, 1.0 * toward_z
+    many_y, many_z = scene.brick_shape[f, 1], scene.brick_shape[f, 2]
+    bricks = address(scene.bricks) + (scene.brick_start[f] << 7)
+    octant = 64 + 8 * (4 * ahead_x + 2 * ahead_y + ahead_z)
+    hop_x, hop_y, hop_z = (toward_x * many_y * many_z) << 7, (toward_y * many_z) << 7, toward_z << 7
+    rank = rank_of(scene.steps[f], level)
     bx, by, bz = cx >> BRICK_SHIFT, cy >> BRICK_SHIFT, cz >> BRICK_SHIFT
+    brick = ((bx * many_y + by) * many_z + bz) << 7
+    far_x = 1.0 * ((bx + ahead_x) << BRICK_SHIFT)
+    far_y = 1.0 * ((by + ahead_y) << BRICK_SHIFT)
+    far_z = 1.0 * ((bz + ahead_z) << BRICK_SHIFT)
+    beyond = (scene.brick_shape[f, 0] * many_y * many_z) << 7
     started = False
-    while True:
-        # The far planes of the brick; the last ones of the field are those of its border.
-        bound_x = min((bx + ahead_x) << BRICK_SHIFT, last_x) * ix + kx
-        bound_y = min((by + ahead_y) << BRICK_SHIFT, last_y) * iy + ky
-        bound_z = min((bz + ahead_z) << BRICK_SHIFT, last_z) * iz + kz
-        t_brick = min(bound_x, bound_y, bound_z)
-        if scene.bricks[brick_start + bx * brick_x + by * brick_y + bz] >= level:
-            if started:
-                cx = follow(ux, t, dx, bx << BRICK_SHIFT, min((bx + 1) << BRICK_SHIFT, last_x) - 1)
-                cy = follow(uy, t, dy, by << BRICK_SHIFT, min((by + 1) << BRICK_SHIFT, last_y) - 1)
-                cz = follow(uz, t, dz, bz << BRICK_SHIFT, min((bz + 1) << BRICK_SHIFT, last_z) - 1)
-            while True:
-                # Go from cell to cell.
-                tx, ty, tz = (cx + ahead_x) * ix + kx, (cy + ahead_y) * iy + ky, (cz + ahead_z) * iz + kz
-                t_cell = max(t, min(tx, ty, tz))
-                corner = start + cx * step_x + cy * step_y + cz
-                across = corner + step_x
-                v = scene.values
-                if (
-                    max(v[corner], v[corner + 1], v[corner + step_y], v[corner + step_y + 1]) >= level
-                    or max(v[across], v[across + 1], v[across + step_y], v[across + step_y + 1]) >= level
-                ):
-                    ex = min(max(ux + t * dx - cx, 0.0), 1.0)
-                    ey = min(max(uy + t * dy - cy, 0.0), 1.0)
-                    ez = min(max(uz + t * dz - cz, 0.0), 1.0)
-                    q0, q1, q2, q3 = cubic(v, corner, step_x, step_y, level, ex, ey, ez, dx, dy, dz)
-                    if on_surface:
-                        root = next_root(q1, q2, q3, t_cell - t)
-                    elif q0 >= 0.0:
-                        root = 0.0
-                    else:
-                        root = first_root(q0, q1, q2, q3, t_cell - t)
-                    if root < np.inf:
-                        t += root
-                        return (t, SURFACE, -1) if t < limit else (np.inf, MISS, -1)
-                on_surface = False
-                t = t_cell
-                if t >= t_brick:
-                    break
-                # Without branches: which plane comes first is a coin toss that no processor predicts.
-                by_x, by_y = tx <= ty and tx <= tz, ty < tx and ty <= tz
-                cx += toward_x if by_x else 0
-                cy += toward_y if by_y else 0
-                cz += 0 if by_x or by_y else toward_z
-        t, started, on_surface = max(t, t_brick), True, False
-        by_x, by_y = bound_x <= bound_y and bound_x <= bound_z, bound_y < bound_x and bound_y <= bound_z
-        bx += toward_x if by_x else 0
-        by += toward_y if by_y else 0
-        bz += 0 if by_x or by_y else toward_z
-        if t >= t_out or bx < 0 or by < 0 or bz < 0:
-            return np.inf, MISS, -1
-        if bx >= scene.brick_shape[f, 0] or by >= scene.brick_shape[f, 1] or bz >= scene.brick_shape[f, 2]:
-            return np.inf, MISS, -1
+    while 0 <= brick < beyond:  # t_out ends the march before that, but for rounding; what follows reads raw memory
+        empty = count_below(bricks, brick + octant, rank)
+        if empty <= 1:
+            tx, ty, tz = far_x * ix + kx, far_y * iy + ky, far_z * iz + kz
+            t_brick = min(tx, ty, tz)
+            if empty == 0:
+                low_x, low_y, low_z = bx << BRICK_SHIFT, by << BRICK_SHIFT, bz << BRICK_SHIFT
+                high_x, high_y, high_z = (
+                    min(low_x + 4, last_x) - 1,
+                    min(low_y + 4, last_y) - 1,
+                    min(low_z + 4, last_z) - 1,
+                )
+                if started:
+                    cx = follow(ux, t, dx, low_x, high_x)
+                    cy = follow(uy, t, dy, low_y, high_y)
+                    cz = follow(uz, t, dz, low_z, high_z)
+                end_x = follow(ux, t_brick, dx, low_x, high_x)
+                end_y = follow(uy, t_brick, dy, low_y, high_y)
+                end_z = follow(uz, t_brick, dz, low_z, high_z)
+                left = at_least(bricks, brick, rank)
+                left &= BETWEEN[((min(cx, end_x) & 3) << 2) | (max(cx, end_x) & 3)]
+                left &= BETWEEN[16 | ((min(cy, end_y) & 3) << 2) | (max(cy, end_y) & 3)]
+                left &= BETWEEN[32 | ((min(cz, end_z) & 3) << 2) | (max(cz, end_z) & 3)]
+                t_end = min(t_brick, t_out)
+                plane_x, plane_y, plane_z = 1.0 * (cx + ahead_x), 1.0 * (cy + ahead_y), 1.0 * (cz + ahead_z)
+                at = ((cx & 3) << 4) | ((cy & 3) << 2) | (cz & 3)
+                while left != 0:
+                    # Go from cell to cell.
+                    sx, sy, sz = plane_x * ix + kx, plane_y * iy + ky, plane_z * iz + kz
+                    t_cell = max(t, min(sx, sy, sz))
+                    bit = ONE << np.uint64(at)
+                    if left & bit != 0:
+                        left ^= bit
+                        lx, ly, lz = plane_x - ahead_x, plane_y - ahead_y, plane_z - ahead_z
+                        corner = start + int(lx) * step_x + int(ly) * step_y + int(lz)
+                        ex = min(max(ux + t * dx - lx, 0.0), 1.0)
+                        ey = min(max(uy + t * dy - ly, 0.0), 1.0)
+                        ez = min(max(uz + t * dz - lz, 0.0), 1.0)
+                        q0, q1, q2, q3 = cubic(scene.values, corner, step_x, step_y, level, ex, ey, ez, dx, dy, dz)
+                        if on_surface:
+                            root = next_root(q1, q2, q3, t_cell - t)
+                        elif q0 >= 0.0:
+                            root = 0.0
+                        else:
+                            root = first_root(q0, q1, q2, q3, t_cell - t)
+                        if root < np.inf:
+                            t += root
+                            return (t, SURFACE, -1) if t < limit else (np.inf, MISS, -1)
+                    on_surface = False
+                    t = t_cell
+                    if t >= t_end:
+                        break
+                    # Without branches: which plane comes first is a coin toss that no processor predicts.
+                    on_x, on_y = sx <= sy and sx <= sz, sy < sx and sy <= sz
+                    plane_x += along_x if on_x else 0.0
+                    plane_y += along_y if on_y else 0.0
+                    plane_z += 0.0 if on_x or on_y else along_z
+                    at += 16 * toward_x if on_x else (4 * toward_y if on_y else toward_z)
+            t, started, on_surface = max(t, t_brick), True, False
+            if t >= t_out:
+                return np.inf, MISS, -1
+            by_x, by_y = tx <= ty and tx <= tz, ty < tx and ty <= tz
+            far_x += 4.0 * along_x if by_x else 0.0
+            far_y += 4.0 * along_y if by_y else 0.0
+            far_z += 0.0 if by_x or by_y else 4.0 * along_z
+            bx += toward_x if by_x else 0
+            by += toward_y if by_y else 0
+            bz += 0 if by_x or by_y else toward_z
+            brick += hop_x if by_x else (hop_y if by_y else hop_z)
+        else:
+            if empty == 8:
+                return np.inf, MISS, -1
+            hop = REACH[empty] - 1
+            up_x, up_y, up_z = hop * toward_x, hop * toward_y, hop * toward_z
+            tx = (far_x + 4.0 * up_x) * ix + kx
+            ty = (far_y + 4.0 * up_y) * iy + ky
+            tz = (far_z + 4.0 * up_z) * iz + kz
+            t, started, on_surface = max(t, min(tx, ty, tz)), True, False
+            if t >= t_out:
+                return np.inf, MISS, -1
+            by_x, by_y = tx <= ty and tx <= tz, ty < tx and ty <= tz
+            far_end_x, far_end_y, far_end_z = bx + up_x, by + up_y, bz + up_z
+            mx = min(max(int(ux + t * dx) >> 2, min(bx, far_end_x)), max(bx, far_end_x))
+            my = min(max(int(uy + t * dy) >> 2, min(by, far_end_y)), max(by, far_end_y))
+            mz = min(max(int(uz + t * dz) >> 2, min(bz, far_end_z)), max(bz, far_end_z))
+            bx = far_end_x + toward_x if by_x else mx
+            by = far_end_y + toward_y if by_y else my
+            bz = mz if by_x or by_y else far_end_z + toward_z
+            brick = ((bx * many_y + by) * many_z + bz) << 7
+            far_x = 1.0 * ((bx + ahead_x) << BRICK_SHIFT)
+            far_y = 1.0 * ((by + ahead_y) << BRICK_SHIFT)
+            far_z = 1.0 * ((bz + ahead_z) << BRICK_SHIFT)
+    return np.inf, MISS, -1
 
 
-@jit
+@inlined
 def dot(a, b):
     """Scalar product of two vectors (3,)."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@jit
+@inlined
 def meet_quad(scene, q, x, d):
     """Distance t at which the frame ray x + t d meets quad q; inf if it does not.
 
@@ -309,7 +386,7 @@ def meet_quad(scene, q, x, d):
     return np.inf
 
 
-@jit
+@inlined
 def march_from(scene, f, level, x, n, d, own, face, limit):
     """First meeting of the frame ray x + t d with field f's trilinear solid, t < limit: (t, what, axis of a cap).
 
@@ -364,7 +441,7 @@ def mesh_from(scene, f, level, x, n, d, own, face, limit):
 meet_solid = either(march_from, mesh_from)
 
 
-@jit
+@inlined
 def nearest_hit(scene, level, x, n, d, on, on_face):
     """First surface along the frame ray x + t d, from surface number `on` (-1: from nowhere): (t, number, what, face).
 

@@ -296,3 +296,30 @@ compiles(peek, types.intp, types.intp, types.intp)(
 @compiles(store, types.none, types.intp, types.intp, types.int32)
 def _(builder: Any, base: Any, i: Any, values: Any) -> None:
     builder.store(values, _place(builder, base, i, values.type), align=4)
+
+
+def at_least(base: Any, i: Any, rank: Any) -> Any:
+    """Number whose bit k says that byte i + k, of 64 bytes from byte i on, is not below `rank`."""
+    return np.packbits(base[i : i + 64] >= rank, bitorder="little").view(np.uint64)[0]
+
+
+def count_below(base: Any, i: Any, rank: Any) -> Any:
+    """How many of the eight bytes from byte i on are below `rank`."""
+    return int((base[i : i + 8] < rank).sum())
+
+
+def _compare(builder: Any, base: Any, i: Any, rank: Any, count: int, relation: str) -> Any:
+    byte, whole = ir.IntType(8), ir.IntType(32)
+    kind = ir.VectorType(byte, count)
+    found = builder.load(builder.inttoptr(builder.add(base, i), kind.as_pointer()), align=1)
+    one = builder.insert_element(ir.Constant(kind, ir.Undefined), builder.trunc(rank, byte), ir.Constant(whole, 0))
+    against = builder.shuffle_vector(one, one, ir.Constant(ir.VectorType(whole, count), [0] * count))
+    return builder.bitcast(builder.icmp_unsigned(relation, found, against), ir.IntType(count))
+
+
+compiles(at_least, types.uint64, types.intp, types.intp, types.intp)(
+    lambda builder, base, i, rank: _compare(builder, base, i, rank, 64, ">=")
+)
+compiles(count_below, types.intp, types.intp, types.intp, types.intp)(
+    lambda builder, base, i, rank: builder.zext(builder.ctpop(_compare(builder, base, i, rank, 8, "<")), ir.IntType(64))
+)

@@ -1,0 +1,105 @@
+"""Where a field is empty, at every isovalue: what lets a ray leap.
+
+A field comes turned, as {v >= level}. Its values become ranks of one byte, and its cells are grouped into bricks of
+BRICK³. What can be skipped at one level is then found by comparing bytes: there is nothing to build for a new one.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+BRICK = 4
+"""Cells along the side of a brick."""
+RANKS = 255
+"""Steps from the lowest rank to the highest."""
+REACH = (1, 2, 3, 4, 6, 8, 16, 1 << 20)
+"""Sides, in bricks, of the cubes that a ray may leap over; the last one goes to the border of the field."""
+
+Bytes = NDArray[np.uint8]
+
+
+class Bricks(NamedTuple):
+    """The ranks of one field.
+
+    rank(x) is the number of `steps` that are not above x. It never falls as x grows, so that what ranks below a level
+    is below it; the converse may fail, and then a cell is looked at in vain.
+    """
+
+    steps: NDArray[np.float32]  # (RANKS,) ascending, filled up with inf
+    shape: tuple[int, int, int]  # bricks along each axis
+    records: Bytes  # (bricks, 128) of each brick, in C order: first its cells, then its cubes towards the 8 octants
+    # cells: (BRICK³) in C order, the rank of the largest value at a cell's corners
+    # cubes: (8, len(REACH)) the largest rank in the cube of so many bricks from here on; octants in C order, up is 1
+
+
+def lay_bricks(values: NDArray[np.float32]) -> Bricks:
+    """Ranks of the cells of a turned field, and of the cubes of bricks towards the eight octants."""
+    steps = _steps(values)
+    ranks: Bytes = np.searchsorted(steps, values.reshape(-1), side="right").astype(np.uint8).reshape(values.shape)
+    for axis in range(3):
+        line = np.moveaxis(ranks, axis, 0)
+        ranks = np.moveaxis(np.maximum(line[:-1], line[1:]), 0, axis)
+    nx, ny, nz = (-(-int(n) // BRICK) for n in ranks.shape)
+    shape = nx, ny, nz
+    ranks = np.pad(ranks, [(0, m * BRICK - int(n)) for m, n in zip(shape, ranks.shape)])
+    split = ranks.reshape(shape[0], BRICK, shape[1], BRICK, shape[2], BRICK)
+    cells = np.ascontiguousarray(split.transpose(0, 2, 4, 1, 3, 5)).reshape(-1, BRICK**3)
+    records = _aligned(len(cells), BRICK**3 + 8 * len(REACH))
+    records[:, : BRICK**3] = cells
+    records[:, BRICK**3 :] = _cubes(cells.max(axis=1).reshape(shape)).reshape(len(cells), -1)
+    return Bricks(steps, shape, records)
+
+
+def _aligned(bricks: int, size: int) -> Bytes:
+    """Room for records that lie on whole cache lines."""
+    room = np.empty(bricks * size + 64, np.uint8)
+    first = -room.ctypes.data % 64
+    return room[first : first + bricks * size].reshape(bricks, size)
+
+
+def _steps(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Steps for the ranks: half of them equal shares of the voxels, half of them equal steps of the value.
+
+    They lie an ulp above values: of data with few distinct values the ranks tell every level apart.
+    """
+    flat = values.reshape(-1)
+    found = np.unique(flat[:: max(1, flat.size >> 16)])
+    if len(found) > RANKS:
+        by_share = found[np.linspace(0, len(found) - 1, RANKS // 2).astype(int)]
+        by_value = np.linspace(found[0], found[-1], RANKS - RANKS // 2, dtype=np.float32)
+        found = np.unique(np.concatenate([by_share, by_value]))
+    steps = np.full(RANKS, np.inf, np.float32)
+    steps[: len(found)] = np.nextafter(found, np.float32(np.inf))
+    return steps
+
+
+def _cubes(largest: Bytes) -> Bytes:
+    """Largest rank in the cubes of REACH bricks that begin at each brick, (bricks, 8, len(REACH))."""
+    out = np.zeros((largest.size, 8, len(REACH)), np.uint8)
+    for octant in range(8):
+        # Seen along the octant every axis goes up.
+        turn = tuple(slice(None, None, 1 if octant >> (2 - axis) & 1 else -1) for axis in range(3))
+        cube = largest[turn]
+        side = 1
+        for k, reach in enumerate(REACH):
+            cube = _reaching(cube, side, reach)
+            side = reach
+            out[:, octant, k] = cube[turn].reshape(-1)
+    return out
+
+
+def _reaching(cube: Bytes, side: int, reach: int) -> Bytes:
+    """Largest rank in cubes of `reach` bricks up each axis, from that in cubes of `side`: overlapping ones cover it."""
+    for axis in range(3):
+        line = np.moveaxis(cube, axis, 0)
+        if reach >= len(line):
+            line = np.maximum.accumulate(line[::-1])[::-1]
+        else:
+            n, covered, line = len(line), int(side), line.copy()
+            while covered < reach:
+                shift = min(covered, reach - covered)
+                line[: n - shift] = np.maximum(line[: n - shift], line[shift:])
+                covered += shift
+        cube = np.moveaxis(line, 0, axis)
+    return cube
