@@ -58,7 +58,7 @@ def fields():
         "forty Gaussians": Scene.sky(gaussians(48), range=(0.2, 1.2)),
         "the same, noisy": Scene.sky(noisy(), range=(0.3, 1.0)),
         "labyrinth": Scene.sky(labyrinth(), range=(-0.4, 0.4)),
-        "hollows": Scene.sky(gaussians(48, seed=5), range=(0.4, 1.2), inside="below"),
+        "colored": Scene.sky(gaussians(48, seed=5), (0.4, 0.6, 0.9), range=(0.3, 1.2)),
         "on a floor": Scene.floor(gaussians(48, count=15, seed=9), range=(0.2, 0.8)),
     }
 

@@ -44,7 +44,7 @@ FIELDS = {
     "few bumps": lambda: Scene.sky(bumps(24, 9, 4, (0.12, 0.25)), range=(0.2, 0.7)),
     "labyrinth": lambda: Scene.sky(gyroid(22), range=(-0.4, 0.4)),
     "on a floor": lambda: Scene.floor(ball(20), range=(0.4, 0.9)),
-    "dents": lambda: Scene.sky(bumps(24, 10, 7), range=(0.4, 1.0), inside="below"),
+    "colored bumps": lambda: Scene.sky(bumps(20, 14, 9, (0.15, 0.3)), (0.4, 0.6, 0.9), (0.3, 0.9)),
 }
 
 

@@ -160,17 +160,18 @@ class Pilot:
     few: Truth
 
     @classmethod
-    def start(cls, scene: Scene, backend: Backend, points: int, error: float, seed: int) -> "Pilot":
+    def start(cls, scene: Scene, backend: Backend, points: int, error: float, seed: int, most: int = 1024) -> "Pilot":
         """Light some points well enough to judge an `error`, with paths so long that a tenth of it is left out.
 
-        The truth's own variance is subtracted wherever it is used, so that it may be as large as the error judged.
+        The truth's own variance is subtracted wherever it is used, so that it may be as large as the error judged; it
+        has at most `most` paths.
         """
         asked = unseen_in_volume(scene, points, seed)
         first = begin(scene, backend, asked, enough(scene, backend, 0.1 * error, seed), seed)
         if not len(first) or not first.mean > 0:
             raise BadInput("no light reaches the surfaces of this scene; expected a background or a lamp that does")
         few = Truth(first.samples[:: max(1, len(first) // 512)], first.bounces)
-        return cls(scene, backend, seed, converge(first, scene, backend, seed, error, 1024), few)
+        return cls(scene, backend, seed, converge(first, scene, backend, seed, error, most), few)
 
     def fewer(self, bounces: int) -> Samples:
         """The light at the points with fewer bounces, by the same paths."""

@@ -100,8 +100,10 @@ def _ladder(
         found.append(now := pilot.measure(grid, fewer, bounces, PATHS))
         if pace.seconds(now.nodes, FEWEST) > seconds or now.nodes > MOST_NODES:
             break
-        if error is not None and now.floor < 0.1 * error**2:
-            break
+        if error is not None:
+            choice = choose(found, pace, 0, error, np.inf, None)
+            if choice.met and pace.seconds(now.nodes, FEWEST) >= choice.seconds:
+                break  # a finer grid takes longer than what will do
     return found
 
 
@@ -151,17 +153,19 @@ def planned(
     walls = sum(len(queries) for queries in wall_queries(scene, levels))
     candidates = [grid] if grid else sizes(scene)
     pace = timed(scene, backend, candidates[len(candidates) // 2], 32, 4, seed)
-    goal, left, points = 0.02 if error is None else error, np.inf, 1024
+    goal, left, points = 0.02 if error is None else error, np.inf, 384
     if seconds is not None:  # the first look takes a tenth of the time
         left = JUDGED * seconds
-        points = int(np.clip(0.1 * left / pace.path / (2 * 8 * PATHS * len(candidates)), 96, 1024))
+        points = int(np.clip(0.1 * left / pace.path / (2 * 8 * PATHS * len(candidates)), 96, 384))
     pilot = Pilot.start(scene, backend, points, goal, seed)
     followed = pilot.bounces_for(SHARE * goal) if bounces is None else bounces
     tried = _ladder(pilot, candidates, followed, pace, error, left)
     choice = choose(tried, pace, walls, error, left, paths)
     near = [m.grid for m in tried if 0.6 < m.grid / choice.measured.grid < 1.7]
-    # A closer look around it, at more points, for a sixth of the time that the run will take.
+    # A closer look around it, at more points: for a sixth of the time that the run will take, or with time to spare.
     more = int(min(8192.0, choice.seconds / 6 / pace.path / (2 * 8 * PATHS * len(near))))
+    if seconds is None:
+        more = max(more, 1536)
     if more > 1.5 * points:
         goal = choice.error if error is None else error
         pilot = Pilot.start(scene, backend, more, goal, seed + 1)

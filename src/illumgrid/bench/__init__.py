@@ -113,7 +113,7 @@ def bench(
     def tell(what: str = "race") -> None:
         progress(what, min(int(time.perf_counter() - begun), int(budget)), int(budget))
 
-    pilot = Pilot.start(scene, auto, 512, 0.02, seed)
+    pilot = Pilot.start(scene, auto, 256, 0.02, seed, 64)
     bounces = pilot.bounces_for(0.002)
     most = enough(scene, auto, 2e-4, seed)
     tracers = {way.surface: way.backend for way in entrants[::-1]}

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from illumgrid import preview, tone
 from illumgrid.grid import IlluminationGrid, WallTexture
 from illumgrid.illumination import Illumination
-from illumgrid.preview import software
+from illumgrid.preview.software import SIDE
 from illumgrid.samples import Queries
 from illumgrid.scene import Scene, level_table
 from illumgrid.stages import Backend
@@ -70,9 +70,7 @@ class Studio:
     @classmethod
     def open(cls, scene: Scene, backend: Backend, truth: Truth, seed: int, paths: float) -> "Studio | None":
         """A studio whose converged picture takes about so many paths; None if that is too few, or without FLIP."""
-        height = int(
-            np.sqrt(paths / PATHS / software.SIDE**2 / (4 / 3) / 0.4)
-        )  # a surface covers some 40 % of a picture
+        height = int(np.sqrt(paths / PATHS / SIDE**2 / (4 / 3) / 0.4))  # a surface covers some 40 % of a picture
         height = min(240, height // 12 * 12)
         if height < 48 or importlib.util.find_spec("flip_evaluator") is None:
             return None

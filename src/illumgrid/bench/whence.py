@@ -26,7 +26,7 @@ def bars(
 ) -> list[Bar]:
     """Measure the parts on grids of these sizes, cheapest first, as far as the time goes."""
     begun = time.perf_counter()
-    pilot = Pilot.start(scene, backend, points, 0.004, seed + 1)
+    pilot = Pilot.start(scene, backend, points, 0.004, seed + 1, 256)
     fewer = pilot.fewer(bounces)
     found: list[Bar] = []
     last = 0.0
