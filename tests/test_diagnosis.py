@@ -1,6 +1,7 @@
 """What is told before any light is computed: each finding where it belongs, and nothing on clean data."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -212,3 +213,8 @@ def test_one_warning_is_switched_off_by_its_name(recwarn):
     tell("border", "is heard")
     assert [str(w.message) for w in recwarn] == ["border: is heard"]
     assert all(name.isalpha() for name in WARNINGS)
+
+
+def test_every_warning_stands_on_its_page():
+    page = (Path(__file__).parents[1] / "docs" / "stability.md").read_text()
+    assert all(f"| `{name}` |" in page for name in WARNINGS)
