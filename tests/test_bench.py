@@ -72,7 +72,8 @@ def test_a_race_goes_from_cheap_to_dear_and_keeps_its_seeds(truth):
     while lane := race.next(np.inf):
         race.step(lane)
         assert len(race.points) < 60
-    assert {p.label for p in race.points} >= {"direct, numba, nearest", "uniform 8, numba, nearest"}
+    ways = {"direct, numba (levelset), nearest", "uniform 8, numba (levelset), nearest"}
+    assert {p.label for p in race.points} >= ways
     assert {p.grid for p in race.points if p.way is WAY} == {4, 7}
     for p in race.points:
         assert len(p.light) == 1 and p.light[0].shape == (len(exact), 3) and p.seconds[0] > 0
@@ -148,7 +149,7 @@ def test_the_chart_can_be_drawn_of_one_point_and_of_many(truth):
         figure = chart.draw(some, BARS, "a ball")
         left, right = figure.axes
         assert left.get_xscale() == left.get_yscale() == "log" and "seconds" in left.get_xlabel()
-        assert "direct, numba, nearest" in [t.get_text() for t in left.get_legend().get_texts()]
+        assert "direct, numba (levelset), nearest" in [t.get_text() for t in left.get_legend().get_texts()]
         heights = [sum(bars[k].get_height() for bars in right.containers if hasattr(bars, "patches")) for k in range(3)]
         np.testing.assert_allclose(
             heights, [100 * np.sqrt(sum(vars(b.split).values()) - 1e-6) for b in BARS], rtol=1e-3
