@@ -84,7 +84,7 @@ def test_options_of_stages_are_set_one_by_one_and_go_before_those_of_the_run(cal
     call(*told, "--isovalues", "4", "--threads", "1", "-o", "a")
     made = recipe(tmp_path / "a")
     assert made["sampler"] == {"name": "uniform", "count": 4, "points": 0} and made["isovalues"] == 4
-    assert made["backend"] == {"name": "numba", "threads": 1}
+    assert made["backend"] == {"name": "numba", "threads": 1, "surface": "auto"}
     own = "--set sampler.count=3 --set sampler.points=100 --set backend.threads=2"
     call(*told, "--isovalues", "4", "--threads", "1", *own.split(), "-o", "b")
     made = recipe(tmp_path / "b")
