@@ -230,6 +230,13 @@ def test_info_takes_values_that_differ_in_their_last_digits_only(call, tmp_path)
     call("run", "far.npy", *QUICK, "--no-preview", "-o", "out")
 
 
+def test_a_run_says_once_which_backend_auto_took_and_why(call):
+    said = call("run", "v.npy", *RANGE, *QUICK, "--no-preview", "-o", "auto")
+    assert said.count("backend: numba (it marches") == 1
+    named = call("run", "v.npy", *RANGE, *QUICK, "--backend", "numba", "--no-preview", "-o", "named")
+    assert "backend:" not in named
+
+
 def test_info_tells_of_a_run_what_is_inside(call):
     call("run", "v.npy", *RANGE, *QUICK, "--seed", "4", "--no-preview", "-o", "out")
     said = call("info", "out")

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numba import typeof
 
 from illumgrid.levelset import in_frame, isosurface, marchable, off_the_data, turned, upward
 from illumgrid.samples import Queries
@@ -207,3 +208,9 @@ def test_queries_reach_a_backend_in_the_frame_with_levels_turned_up():
     np.testing.assert_allclose(point / UNEVEN, world_to_index(volume, queries.point), atol=1e-12)
     np.testing.assert_allclose(normal @ volume.direction.T, queries.normal, atol=1e-12)
     assert np.array_equal(level, -queries.level)
+
+
+def test_all_scenes_are_laid_out_as_one_type_so_that_kernels_compile_once():
+    above, below = Scene.sky(ball(6), range=(0.3, 0.9)), Scene.sky(ball(6), range=(0.3, 0.9), inside="below")
+    two = Scene((*above.fields, Field("other", ball(5), range=(0.3, 0.9))), Scene.box(ball(6)).quads)
+    assert len({str(typeof(marchable(scene))) for scene in (above, below, two)}) == 1

@@ -21,10 +21,11 @@ from illumgrid.levelset import in_frame, isosurface
 from illumgrid.rng import stream
 from illumgrid.samples import Queries, Samples, join_queries
 from illumgrid.scene import Scene
+from illumgrid.stages import on_level_sets
 from illumgrid.volume import Volume
 from rooms import MIRRORED, ROOMS, on_quads
 from shapes import sampled
-from transport import colored, furnace, noise, on_sets, on_voxels, waves, worth
+from transport import colored, furnace, noise, on_sets, on_voxels, rotation, waves, worth
 
 SAME = 1e-3
 MESH = Numba(surface="mesh", threads=1)
@@ -104,7 +105,7 @@ def test_kernels_and_embree_agree_on_many_paths(name):
     scene = ROOMS[name]()
     queries = questions(scene, 150)
     flips = total = 0
-    for path in range(8):
+    for path in range(5):
         one, answered = worth(MESH, scene, queries, path, 5, seed=3)
         other, also = worth(Embree(), scene, queries, path, 5, seed=3)
         np.testing.assert_array_equal(answered, also)
@@ -147,6 +148,26 @@ def test_mesh_and_level_set_differ_like_the_square_of_the_spacing():
         assert np.abs(np.mean(off, axis=0)).max() < turned[-1]  # no more than what turned: the rest moved by spacing²
     rate = -np.polyfit(np.log([1, 2, 4, 8]), np.log(turned), 1)[0]
     assert 1.7 < rate < 2.6, turned
+
+
+# Sealed cavities.
+
+
+@pytest.mark.parametrize("extents", [0.0, 1e5])
+@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
+@pytest.mark.parametrize("backend", ["numba", pytest.param("embree", marks=needs_embree)])
+def test_no_light_leaks_through_the_meshes_of_a_sealed_cavity(backend, scale, extents):
+    # Four grays, and levels at and next to them: vertices of the mesh crowd at voxels. Mirrors all over, light outside.
+    spacing = scale * np.array([1.0, 0.7, 1.9])
+    values = np.random.default_rng(11).integers(0, 4, (6, 7, 8))
+    shell = np.pad(values, 1, constant_values=300)
+    place = {"origin": extents * 9 * spacing.max() * np.array([1, -1, 1]), "spacing": spacing, "direction": rotation()}
+    scene = Scene.sky(Volume(shell, **place), (1, 1, 1), (-0.5, 256.0))
+    queries = join_queries(list(on_level_sets(scene, [1.3, 2.0, 2.001], 0, points=150)))
+    stage = MESH if backend == "numba" else Embree(threads=1)
+    answer = stage.solve(scene, queries, paths=range(50), bounces=6, seed=4)
+    assert answer.paths.sum() > 20_000
+    assert not answer.mean.any(), f"{answer.mean.any(axis=1).sum()} of {len(queries)} queries see the sky"
 
 
 # Groups, cache, limit.

@@ -100,14 +100,35 @@ def holes_within_range(scene: Scene, field: int, grid: IlluminationGrid) -> int:
     return int(seen.sum())
 
 
+def _on_few_rows(scene: Scene, seed: int, rows: int = 4, count: int = 32) -> Queries:
+    """About `count` queries on each of a few rows of the sweep, from the nodes of a coarse grid.
+
+    Few, because a backend of meshes builds one a row. The nodes of all fields, sorted by their place in the sweep, are
+    cut into equal parts; those nearest to the middle of a part move onto its row.
+    """
+    specs = [GridSpec.over(field.volume, 10) for field in scene.fields]
+    nodes = join_queries([q for q in Direct().queries(scene, specs, seed) if len(q)])
+    low, high = np.array([field.range for field in scene.fields])[nodes.target].T
+    place = (nodes.level[np.arange(len(nodes)), nodes.target] - low) / (high - low)
+    shuffled = np.random.default_rng(seed).permutation(len(nodes))  # many stand at an end of the range
+    asked = []
+    for number, part in enumerate(np.array_split(shuffled[np.argsort(place[shuffled], kind="stable")], rows)):
+        middle = place[part[len(part) // 2]] if len(part) else 0.0
+        near = part[np.argsort(np.abs(place[part] - middle), kind="stable")[:count]]
+        for field in np.unique(nodes.target[near]):
+            points = nodes.point[near[nodes.target[near] == field]]
+            level = scene.levels(middle)[0, field]
+            first = (number * len(scene.fields) + int(field)) * count
+            asked.append(Queries.at(scene, points, field=int(field), level=level, first_id=first))
+    return join_queries(asked)
+
+
 def light_left_out(scene: Scene, backend: Backend, bounces: int, seed: int = 0) -> float:
     """Share of all light that more than `bounces` reflections would add, from a few paths on a coarse grid.
 
     The paths with more bounces begin as those with fewer, so that the difference is light and not noise.
     """
-    specs = [GridSpec.over(field.volume, 10) for field in scene.fields]
-    asked = join_queries([q for q in Direct().queries(scene, specs, seed) if len(q)])
-    asked = asked[:: max(1, len(asked) // 128)]
+    asked = _on_few_rows(scene, seed)
     mean = [
         float(backend.solve(scene, asked, paths=range(16), bounces=b, seed=seed).mean.mean())
         for b in (bounces, 3 * bounces + 20)

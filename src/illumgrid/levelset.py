@@ -136,8 +136,10 @@ def marchable(scene: Scene) -> Marchable:
     bricks = [p[1] for p in parts]
     records = [b.records.reshape(-1) for b in bricks]
     materials = [f.material for f in scene.fields] + [q.material for q in scene.quads]
+    together = values[0].view() if len(parts) == 1 else np.concatenate(values)
+    together.setflags(write=False)  # as a lone volume is: else Numba compiles all kernels again, for another type
     return Marchable(
-        values=values[0] if len(parts) == 1 else np.concatenate(values),
+        values=together,
         start=np.cumsum([0, *(len(v) for v in values)], dtype=np.int64)[:-1],
         shape=np.array([p[0].shape for p in parts], dtype=np.int64),
         origin=scene.to_frame([f.volume.origin for f in scene.fields]),

@@ -202,6 +202,8 @@ def run(
             say(f"{field.name}: {shape} voxels, isovalues {field.range[0]:.4g} to {field.range[1]:.4g}")
             for finding in diagnose(field, nodes_over(field.volume, grid)):
                 tell(finding.name, finding.sentence)
+        if backend == "auto":
+            say(_why_auto())
         with told_progress() as progress:
             light = light_up(
                 scene, **stages, grid=grid, paths=paths, bounces=bounces, isovalues=isovalues, seed=seed,
@@ -212,6 +214,13 @@ def run(
     recipe = {**light.recipe, "input": source or given.name, "smooth": smooth or 0.0, "warnings": sentences}
     replace(light, recipe=recipe).save(folder, preview=not no_preview, overwrite=overwrite)
     _told_result(light, folder, time.perf_counter() - begun, picture=not no_preview)
+
+
+def _why_auto() -> str:
+    """Which backend `auto` took, and why."""
+    from illumgrid import registry
+
+    return f"backend: {registry.auto_backend()} ({registry.WHY_AUTO})"
 
 
 def _judged(light: "Illumination", backend: Any, seed: int) -> "Illumination":

@@ -1,0 +1,120 @@
+"""How the error falls with the number of paths, and whether its bars tell: ``python benchmarks/convergence.py``.
+
+Writes the figure and the table of the page "Is it right?" (`docs/images/convergence.png`, `convergence_table.md`); a
+minute on one thread. `numba` marches four scenes. The truth is two independent means A and B of many paths each: the
+mean of (light - A)(light - B) is the squared error of the light, without any of theirs.
+"""
+
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from illumgrid import Material, Scene, Volume, backend
+from illumgrid.samples import join_queries
+from illumgrid.stages import on_level_sets
+
+IMAGES = Path(__file__).parent.parent / "docs" / "images"
+COUNTS = 4 * 2 ** np.arange(8)
+SEEDS = 3  # of every count, to steady the curves
+LONG = (8192, 200)  # paths of a truth of the curves, and its queries
+WIDE = (2048, 1000)  # of the bars
+BOUNCES = 4
+ROUNDING = 2e-6  # of the light: many a query whose paths are all worth the same has a bar of 0, rightly
+SOLVE = backend("numba", threads=1).solve
+
+
+def scenes():
+    """Scenes by name, from smooth light to rough."""
+    x = np.linspace(-1, 1, 33)
+    distance = np.sqrt(x[:, None, None] ** 2 + x[:, None] ** 2 + x**2)
+    ball = Volume(1.2 - distance, np.full(3, -1.0), np.full(3, 2 / 32))
+    raw = Volume(np.random.default_rng(1).integers(0, 256, (20, 20, 20)))
+    black = Scene.floor(ball, albedo=(0, 0, 0), range=(0.3, 0.9))
+    floor = replace(black.quads[0], material=Material(np.zeros(3)))
+    return {
+        "black ball, black floor, sky": replace(black, quads=(floor,)),
+        "ball on a floor, sky": Scene.floor(ball, range=(0.3, 0.9)),
+        "ball in the box with a lamp": Scene.box(ball, range=(0.3, 0.9)),
+        "raw noise, sky": Scene.sky(raw, range=(40, 215)),
+    }
+
+
+def asked(scene, count):
+    """`count` queries on eight level sets that have a normal, in any order."""
+    rows = scene.levels((np.arange(8) + 0.5) / 8)
+    queries = join_queries(list(on_level_sets(scene, rows, 0, points=count // 6)))
+    queries = queries[queries.normal.any(axis=1)]
+    return queries[np.random.default_rng(0).permutation(len(queries))[:count]]
+
+
+def light(scene, queries, paths, seed):
+    answer = SOLVE(scene, queries, paths=range(paths), bounces=BOUNCES, seed=seed)
+    assert answer.paths.all()
+    return answer.mean.astype(float), answer.stderr.astype(float)
+
+
+def curve(scene):
+    """Relative RMS error for each of COUNTS."""
+    queries = asked(scene, LONG[1])
+    one, other = (light(scene, queries, LONG[0], 1000 + k)[0] for k in (0, 1))
+    squares = [
+        np.mean([(mean - one) * (mean - other) for mean in (light(scene, queries, int(n), k)[0] for k in range(SEEDS))])
+        for n in COUNTS
+    ]
+    return np.sqrt(squares) / one.mean()
+
+
+def bars(scene, paths, truths):
+    """Share of the queries' colours whose 95 % bar covers the truth, and the median bar over the RMS error."""
+    (one, its), (other, others) = truths
+    mean, bar = light(scene, asked(scene, WIDE[1]), paths, 0)
+    rms = np.sqrt(np.mean((mean - one) * (mean - other)))
+    off, wide = np.abs(mean - 0.5 * (one + other)), np.hypot(bar, 0.5 * np.hypot(its, others))
+    return (off <= 1.96 * wide + ROUNDING * mean).mean(), np.median(bar) / rms
+
+
+def draw(curves):
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(figsize=(6.4, 4.4), layout="constrained")
+    for (name, error), marker, color in zip(curves.items(), "Dos^", ("tab:purple", "tab:blue", "tab:orange", "tab:green")):
+        axes.loglog(COUNTS, 100 * error, marker=marker, color=color, label=f"{name}: paths$^{{{slope(error):.2f}}}$")
+    start = 130 * max(error[0] for error in curves.values())
+    axes.loglog(COUNTS, start * (COUNTS / COUNTS[0]) ** -0.5, "--", color="0.5", label="paths$^{-0.5}$")
+    axes.set(xlabel="paths from every query", ylabel="RMS error, % of the mean light")
+    axes.set_xticks(COUNTS, [str(n) for n in COUNTS])
+    axes.minorticks_off()
+    axes.set_yticks([0.1, 0.3, 1, 3, 10, 30], ["0.1", "0.3", "1", "3", "10", "30"])
+    axes.grid(color="0.9")
+    axes.legend(frameon=False, loc="lower left")
+    figure.savefig(IMAGES / "convergence.png", dpi=110)
+
+
+def slope(error):
+    """Exponent of the power of the number of paths that fits best."""
+    return np.polyfit(np.log(COUNTS), np.log(error), 1)[0]
+
+
+def main():
+    curves, lines = {}, ["| scene | paths | covered | median bar / RMS error |", "|---|---|---|---|"]
+    for name, scene in scenes().items():
+        curves[name] = curve(scene)
+        told = "  ".join(f"{n}: {e:.3%}" for n, e in zip(COUNTS, curves[name]))
+        print(f"{name}: paths^{slope(curves[name]):.2f}   {told}", flush=True)
+        truths = [light(scene, asked(scene, WIDE[1]), WIDE[0], 1000 + k) for k in (0, 1)]
+        for paths in (16, 64, 256):
+            covered, ratio = bars(scene, paths, truths)
+            lines.append(f"| {name} | {paths} | {covered:.1%} | {ratio:.2f} |")
+            print(lines[-1], flush=True)
+    draw(curves)
+    (IMAGES / "convergence_table.md").write_text("\n".join(lines) + "\n")
+    print(f"{sum(os.times()[:2]):.0f} s of CPU")
+
+
+if __name__ == "__main__":
+    main()
