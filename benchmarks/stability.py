@@ -1,6 +1,6 @@
 """Where methods fail: the error of every method against the parameter that breaks it.
 
-``python benchmarks/stability.py`` measures (about ten minutes on two cores) and writes the figure and the numbers of
+``python benchmarks/stability.py`` measures (some minutes on two cores) and writes the figure and the numbers of
 the page "Where methods fail" into docs/images; ``--only noise`` measures one curve and prints it.
 """
 
@@ -27,7 +27,7 @@ METHODS = {
     "adaptive, splat": ("adaptive", "splat"),
 }
 IMAGES = Path(__file__).parents[1] / "docs" / "images"
-N = 40
+N = 28
 
 
 def hills(n: int = N, seed: int = 0, noise: float = 0.0, flatten: float = 1.0, stretch: float = 1.0) -> Volume:
@@ -51,7 +51,7 @@ def sky(volume: Volume, low: float = 0.15, high: float = 0.75) -> Scene:
 
 def sheet(nodes: float) -> Scene:
     """A plate of so many node spacings, lit from above; below it is a black floor."""
-    x = (np.stack(np.indices((N, N, N)), axis=-1) - (N - 1) / 2) / (N / 2)
+    x = (np.stack(np.indices((N, N, N)), axis=-1) - N // 2) / (N / 2)  # a plane of voxels lies in the plate
     depth = np.maximum(np.abs(x[..., 2]) - nodes / N, np.abs(x[..., :2]).max(axis=-1) - 0.8)
     scene = Scene.floor(Volume(-depth), range=(-0.3 * nodes / N, 0.3 * nodes / N))
     return replace(scene, quads=tuple(replace(q, material=Material(np.zeros(3))) for q in scene.quads))
@@ -59,7 +59,7 @@ def sheet(nodes: float) -> Scene:
 
 def pair() -> Scene:
     """Two balls that melt into one at isovalue 0.7."""
-    x = (np.stack(np.indices((60, N, N)), axis=-1) - [29.5, 19.5, 19.5]) / 19.5
+    x = (np.stack(np.indices((44, N, N)), axis=-1) - [21.5, 13.5, 13.5]) / 13.5
     distance = [np.linalg.norm(x - [side * 0.5, 0, 0], axis=-1) for side in (-1, 1)]
     return Scene.sky(Volume(1.2 - np.minimum(*distance)), range=(0.5, 0.9))
 
@@ -70,7 +70,7 @@ def power(p: float) -> Scene:
     return Scene.sky(Volume(1 - np.linalg.norm(x, axis=-1) ** p), range=(0.2, 0.98))
 
 
-def lit(scene: Scene, method: str, levels: int = 16, paths: int = 64, grid: int | None = None) -> "ig.Illumination":
+def lit(scene: Scene, method: str, levels: int = 12, paths: int = 32, grid: int | None = None) -> "ig.Illumination":
     """The light of a scene by one of the methods."""
     sampler, interpolator = METHODS[method]
     options = {} if sampler == "direct" else {"count": levels}
@@ -83,8 +83,8 @@ def lit(scene: Scene, method: str, levels: int = 16, paths: int = 64, grid: int 
 def judged(scene: Scene, grids: dict[str, "ig.Illumination"]) -> dict[str, float]:
     """Relative RMSE of each at points on isovalues that nobody visited."""
     backend = ig.backend("numba")
-    asked = unseen_on_level_sets(scene, 12, 600, 7)
-    truth = converge(begin(scene, backend, asked, 3, 7), scene, backend, 7, 0.005, 2048)
+    asked = unseen_on_level_sets(scene, 10, 400, 7)
+    truth = converge(begin(scene, backend, asked, 3, 7), scene, backend, 7, 0.005, 512)
     return {name: errors(look_up(light.grids, truth.samples.queries), truth).rmse for name, light in grids.items()}
 
 
@@ -126,14 +126,14 @@ def by_distance() -> Iterator[tuple[float, dict[str, float]]]:
         parts = []
         for level in (0.7 - off, 0.7 + off):
             mesh = ig.isosurface(scene.fields[0].volume, level)
-            near = mesh.vertices[np.abs(mesh.vertices[:, 0] - 29.5) < 6]  # around the neck
+            near = mesh.vertices[np.abs(mesh.vertices[:, 0] - 21.5) < 5]  # around the neck
             parts.append(
                 ig.Queries.at(scene, near[:: max(1, len(near) // 300)], level=level, first_id=len(parts) << 20)
             )
 
         asked = join_queries(parts)
         asked = asked[np.flatnonzero(asked.normal.any(axis=1))]
-        truth = converge(begin(scene, backend, asked, 3, 7), scene, backend, 7, 0.005, 2048)
+        truth = converge(begin(scene, backend, asked, 3, 7), scene, backend, 7, 0.005, 512)
         yield off, {n: errors(look_up(light.grids, truth.samples.queries), truth).rmse for n, light in grids.items()}
 
 
