@@ -82,7 +82,8 @@ def draw(curves):
     import matplotlib.pyplot as plt
 
     figure, axes = plt.subplots(figsize=(6.4, 4.4), layout="constrained")
-    for (name, error), marker, color in zip(curves.items(), "Dos^", ("tab:purple", "tab:blue", "tab:orange", "tab:green")):
+    colors = "tab:purple", "tab:blue", "tab:orange", "tab:green"
+    for (name, error), marker, color in zip(curves.items(), "Dos^", colors):
         axes.loglog(COUNTS, 100 * error, marker=marker, color=color, label=f"{name}: paths$^{{{slope(error):.2f}}}$")
     start = 130 * max(error[0] for error in curves.values())
     axes.loglog(COUNTS, start * (COUNTS / COUNTS[0]) ** -0.5, "--", color="0.5", label="paths$^{-0.5}$")
