@@ -183,7 +183,7 @@ def main() -> None:
     """Measure the curves."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--only", choices=list(CURVES))
-    parser.add_argument("--redraw", action="store_true", help="the figure and the table from the numbers that are there")
+    parser.add_argument("--redraw", action="store_true", help="figure and table from the numbers that are there")
     asked = parser.parse_args()
     warnings.simplefilter("ignore")
     measured: dict[str, list[tuple[float, dict[str, float]]]] = {}
