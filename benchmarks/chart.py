@@ -227,7 +227,7 @@ def main():
     parser.add_argument("--quick", action="store_true", help="smaller budgets")
     asked = parser.parse_args()
     warnings.simplefilter("ignore")
-    figures = json.loads(asked.json.read_text()) if asked.json.exists() else {}
+    figures = json.loads(asked.json.read_text("utf-8")) if asked.json.exists() else {}
     for part in asked.parts or PARTS:
         print(f"{part} ({os.cpu_count()} cores, load {os.getloadavg()[0]:.1f})")
         figures[part] = PARTS[part](asked)

@@ -188,7 +188,7 @@ def main() -> None:
     warnings.simplefilter("ignore")
     measured: dict[str, list[tuple[float, dict[str, float]]]] = {}
     if asked.redraw:
-        measured = json.loads((IMAGES / "stability.json").read_text())
+        measured = json.loads((IMAGES / "stability.json").read_text("utf-8"))
     for name in [] if asked.redraw else CURVES if asked.only is None else [asked.only]:
         measured[name] = list(CURVES[name][1]())
         for value, result in measured[name]:

@@ -166,7 +166,7 @@ def judge(target: Target, file: Path) -> str:
 def _confine() -> None:
     """Limit the memory of this process, and keep the libraries quiet."""
     if sys.platform == "linux":
-        used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+        used = int(Path("/proc/self/statm").read_text("utf-8").split()[0]) * resource.getpagesize()
         resource.setrlimit(resource.RLIMIT_AS, (used + ROOM, used + ROOM))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     sitk.ProcessObject.SetGlobalDefaultNumberOfThreads(1)

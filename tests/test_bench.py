@@ -170,10 +170,10 @@ def test_bench_writes_what_it_says_whole_and_once(call, tmp_path):
     said = call(*arguments)
     assert "the front:" in said and "for 10% use --sampler" in said and "wrote b" in said
     assert sorted(p.name for p in (tmp_path / "b").iterdir()) == ["bench.csv", "bench.json", "chart.png", "chart.svg"]
-    found = json.loads((tmp_path / "b" / "bench.json").read_text())
+    found = json.loads((tmp_path / "b" / "bench.json").read_text("utf-8"))
     assert found["truth"]["levelset"]["points"] >= 1000 and found["truth"]["levelset"]["isovalues"] >= 8
     assert found["parts"] and found["advice"] and found["bounces"] >= 0
-    rows = list(csv.DictReader((tmp_path / "b" / "bench.csv").read_text().splitlines()))
+    rows = list(csv.DictReader((tmp_path / "b" / "bench.csv").read_text("utf-8").splitlines()))
     assert (
         len(rows) == len(found["points"]) and {"seconds", "rmse", "bias", "p95", "flip", "memory_mb"} <= rows[0].keys()
     )
@@ -191,7 +191,7 @@ def test_bench_refuses_before_anything_runs(refuse, tmp_path):
 def test_run_tells_the_error_that_it_reached_and_what_it_chose(call, tmp_path):
     said = call("run", "v.npy", "--range", 0.3, 0.9, "--error", 0.1, "--no-preview", "-o", "e")
     assert "nodes along the longest axis" in said and "error reached" in said and "the pilot said" in said
-    recipe = json.loads((tmp_path / "e" / "run.json").read_text())["recipe"]
+    recipe = json.loads((tmp_path / "e" / "run.json").read_text("utf-8"))["recipe"]
     assert recipe["plan"]["why"] and recipe["reached"]["rmse"] < 0.13
     assert "error reached" in call("run", "v.npy", "--range", 0.3, 0.9, "--grid", 5, "--no-preview", "-o", "plain")
 

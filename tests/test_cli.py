@@ -20,7 +20,7 @@ def shown(path):
 
 
 def recipe(folder):
-    return json.loads((folder / "run.json").read_text())["recipe"]
+    return json.loads((folder / "run.json").read_text("utf-8"))["recipe"]
 
 
 # run

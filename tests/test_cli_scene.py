@@ -45,7 +45,7 @@ def corner(tmp_path):
 
 
 def recipe(folder):
-    return json.loads((folder / "run.json").read_text())["recipe"]
+    return json.loads((folder / "run.json").read_text("utf-8"))["recipe"]
 
 
 @pytest.mark.parametrize("name", ["sky", "floor", "box"])

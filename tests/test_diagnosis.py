@@ -175,10 +175,10 @@ LIMITS = ("--range", "0.3", "0.9", "--grid", "8", "--paths", "2", "--bounces", "
 def test_a_run_tells_and_records_and_can_be_told_not_to(call, tmp_path):
     np.save(tmp_path / "off.npy", ball(12, at=(0.6, 0, 0)).values)
     assert "note: border: at 0.3 " in call("run", "off.npy", *LIMITS, "-o", "a")
-    assert json.loads((tmp_path / "a" / "run.json").read_text())["recipe"]["warnings"][0].startswith("border: ")
+    assert json.loads((tmp_path / "a" / "run.json").read_text("utf-8"))["recipe"]["warnings"][0].startswith("border: ")
     said = call("run", "off.npy", *LIMITS, "-o", "b", "--ignore", "border", "--ignore", "holes")
     assert "note:" not in said
-    assert json.loads((tmp_path / "b" / "run.json").read_text())["recipe"]["warnings"] == []
+    assert json.loads((tmp_path / "b" / "run.json").read_text("utf-8"))["recipe"]["warnings"] == []
     assert "note: border" in call("info", "off.npy", "--range", "0.3", "0.9")
     assert "note:" not in call("info", "off.npy", "--range", "0.3", "0.9", "--ignore", "border")
 
@@ -216,5 +216,5 @@ def test_one_warning_is_switched_off_by_its_name(recwarn):
 
 
 def test_every_warning_stands_on_its_page():
-    page = (Path(__file__).parents[1] / "docs" / "stability.md").read_text()
+    page = (Path(__file__).parents[1] / "docs" / "stability.md").read_text("utf-8")
     assert all(f"| `{name}` |" in page for name in WARNINGS)

@@ -174,7 +174,7 @@ def lean(tmp_path, monkeypatch):
     write(tmp_path / "warm.nrrd")
     read_volume(tmp_path / "warm.nrrd")
     limits = resource.getrlimit(resource.RLIMIT_AS)
-    used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    used = int(Path("/proc/self/statm").read_text("utf-8").split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (used + 300_000_000, limits[1]))
     yield
     resource.setrlimit(resource.RLIMIT_AS, limits)

@@ -216,7 +216,7 @@ def test_what_is_not_ours_stays(tmp_path, foreign, overwrite):
     for refuse in (lambda: store.claim(out, overwrite), lambda: store.write(out, example(), None, overwrite)):
         with pytest.raises(BadInput, match=f"holds '{foreign.split('/')[0]}', which is not of a finished run"):
             refuse()
-    assert (out / foreign).read_text() == "years of work" and not left_beside(out)
+    assert (out / foreign).read_text("utf-8") == "years of work" and not left_beside(out)
 
 
 def test_a_link_among_our_names_is_not_ours(out):

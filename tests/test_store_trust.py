@@ -23,7 +23,7 @@ def out(tmp_path: Path) -> Path:
 
 def reseal(folder: Path, **changes) -> None:
     """Forge the record so that its checksum agrees with what is there now."""
-    record = json.loads((folder / store.RUN).read_text()) | changes
+    record = json.loads((folder / store.RUN).read_text("utf-8")) | changes
     (folder / store.RUN).write_text(json.dumps(record | {"checksum": store._checksum(record, folder / store.EXR)}))
 
 
@@ -55,7 +55,7 @@ def test_a_format_of_the_future(out):
 
 def forge(folder: Path, *way: str | int, value: object = None, remove: bool = False) -> None:
     """Change one entry of the record, and the checksum with it, so that only the entry itself can be found out."""
-    record = json.loads((folder / store.RUN).read_text())
+    record = json.loads((folder / store.RUN).read_text("utf-8"))
     at = record
     for key in way[:-1]:
         at = at[key]
@@ -123,7 +123,7 @@ def test_wrong_entries_of_a_grid(out, key):
 
 @pytest.mark.parametrize("token", ["NaN", "Infinity", "1e999"])
 def test_numbers_that_json_does_not_have(out, token):
-    text = (out / store.RUN).read_text()
+    text = (out / store.RUN).read_text("utf-8")
     (out / store.RUN).write_text(text.replace('"solve": 0.1', f'"solve": {token}'))
     with pytest.raises(BadInput, match=r"JSON compliant.*give a folder that"):
         store.read(out)

@@ -120,7 +120,7 @@ def test_what_arrives_at_the_last_moment_stays(out, monkeypatch):
     monkeypatch.setattr(store, "claim", look_too_early)
     with pytest.raises(BadInput, match=r"late\.txt"):
         store.write(out, example(seed=1), None, True)
-    assert (out / "late.txt").read_text() == "late" and not left_beside(out)
+    assert (out / "late.txt").read_text("utf-8") == "late" and not left_beside(out)
     (out / "late.txt").unlink()
     assert_same(store.read(out), example())
 

@@ -166,7 +166,7 @@ BAD = {
 def test_wrong_entries_of_a_quad_are_refused(tmp_path, key):
     out = tmp_path / "out"
     store.write(out, example(2), None, False)
-    whole = json.loads((out / store.RUN).read_text())
+    whole = json.loads((out / store.RUN).read_text("utf-8"))
     for value in [*BAD[key], "remove"]:
         record = json.loads(json.dumps(whole))
         record["scene"]["quads"][0][key] = value
