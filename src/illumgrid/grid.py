@@ -106,8 +106,8 @@ class IlluminationGrid:
         """Standard error (nx, ny, nz) of a lookup near each node: noise and interpolation; infinite without support.
 
         Noise: of the nodes' variance a trilinear lookup keeps Σ w² of its weights w, 8/27 in the mean over a cell.
-        Interpolation: between nodes a straight line is off by at most an eighth of the second difference (the bound
-        h²/8 max |f''| of any textbook), which is taken along each axis from the values themselves, less their noise.
+        Interpolation: between nodes a straight line is off by at most an eighth of the second difference (h²/8 times
+        the largest second derivative), which is taken along each axis from the values themselves, less their noise.
         """
         known = (self.support > 0) & np.isfinite(self.error)
         square = np.where(known, 8 / 27 * np.square(self.error, dtype=float), np.inf)
