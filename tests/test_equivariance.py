@@ -42,7 +42,7 @@ def direct_grid(volume, limits, inside="above", seed=0):
     spec = GridSpec.over(volume, max(volume.shape))
     assert spec.shape == volume.shape
     stages = Direct(), Numba(), Nearest()
-    light = bake(scene, [spec], level_table(scene, 2), *stages, paths=range(PATHS), bounces=3, seed=seed)
+    light = bake(scene, [spec], level_table(scene, 2), *stages, paths=[range(PATHS)], bounces=3, seed=seed)
     return light.grids[0]
 
 

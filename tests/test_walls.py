@@ -71,7 +71,7 @@ def baked():
     scene = Scene((field,), (wall,), np.ones(3))
     levels = level_table(scene, 4)
     stages = Direct(), Numba(), Nearest()
-    return scene, levels, bake(scene, [GridSpec.over(field.volume, 4)], levels, *stages, paths=range(8), bounces=2)
+    return scene, levels, bake(scene, [GridSpec.over(field.volume, 4)], levels, *stages, paths=[range(8)], bounces=2)
 
 
 def test_texels_lie_at_the_middles_and_ids_are_their_own(baked):

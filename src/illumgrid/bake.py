@@ -10,7 +10,7 @@ import numpy as np
 
 from illumgrid.grid import GridSpec, IlluminationGrid, WallTexture, fill_holes
 from illumgrid.samplers.direct import Direct, reachable
-from illumgrid.samples import Queries, Samples, join_queries, join_samples
+from illumgrid.samples import Queries, Samples, combine, join_queries, join_samples
 from illumgrid.scene import Levels, Quad, Scene
 from illumgrid.stages import Backend, Interpolator, Sampler
 from illumgrid.volume import interpolate, world_to_index
@@ -40,6 +40,8 @@ class Baked:
         Wall time of each stage.
     queries : int
         Number of questions asked.
+    paths : int
+        Paths walked from each.
     holes : tuple of int
         For each field, nodes that its isosurfaces can show and no sample supports.
     """
@@ -48,6 +50,7 @@ class Baked:
     walls: tuple[WallTexture, ...]
     seconds: dict[str, float]
     queries: int
+    paths: int
     holes: tuple[int, ...]
 
 
@@ -153,7 +156,7 @@ def bake(
     backend: Backend,
     interpolator: Interpolator,
     *,
-    paths: range,
+    paths: Iterable[range],
     bounces: int,
     seed: int = 0,
     map: Map = map,
@@ -170,8 +173,8 @@ def bake(
         Rows of the sweep at which the walls are lit.
     sampler, backend, interpolator
         Stage objects.
-    paths : range
-        Numbers of the paths from every query.
+    paths : iterable of range
+        Numbers of the paths from every query, one range after the other; the next is asked for when one is walked.
     bounces : int
     seed : int
     map : callable, optional
@@ -184,13 +187,17 @@ def bake(
     batches += wall_queries(scene, levels)
     clock.append(time.perf_counter())
 
-    total, done = sum(len(batch) for batch in batches), 0
+    total, walked = sum(len(batch) for batch in batches), 0
     answers: list[Samples] = []
-    progress("light", 0, total)
-    for answer in map(partial(_answer, scene, backend, paths, bounces, seed), batches):
-        answers.append(answer)
-        done += len(answer)
-        progress("light", done, total)
+    for numbers in paths:
+        what, done, new = "more light" if answers else "light", 0, []
+        progress(what, 0, total)
+        for answer in map(partial(_answer, scene, backend, numbers, bounces, seed), batches):
+            new.append(answer)
+            done += len(answer)
+            progress(what, done, total)
+        answers = [combine(one, more) for one, more in zip(answers, new)] if answers else new
+        walked += len(numbers)
     clock.append(time.perf_counter())
 
     grids = []
@@ -208,6 +215,7 @@ def bake(
         walls=tuple(walls),
         seconds=dict(zip(("sampler", "backend", "interpolator"), np.diff(clock).tolist())),
         queries=total,
+        paths=walked,
         holes=tuple(holes_within_range(scene, n, grid) for n, grid in enumerate(grids)),
     )
 

@@ -1,7 +1,8 @@
 """The result, and the way to it: where names of stages become objects."""
 
 import os
-from collections.abc import Mapping
+import time
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from importlib.metadata import version
@@ -14,7 +15,7 @@ from illumgrid import preview, registry, store, tone
 from illumgrid.bake import Map, Progress, bake, enough_bounces, light_left_out
 from illumgrid.errors import BadInput, tell
 from illumgrid.grid import GridSpec, IlluminationGrid, WallTexture
-from illumgrid.plan import judge, planned
+from illumgrid.plan import judge, planned, rounds
 from illumgrid.scene import Levels, Scene, level_table
 from illumgrid.stages import Backend, Interpolator, Sampler
 from illumgrid.volume import Volume
@@ -215,7 +216,8 @@ def run(
     if isovalues is not None and isinstance(sampler, str) and "count" in registry.option_names("sampler", sampler):
         options["count"] = isovalues
     chosen = _stage("sampler", sampler, options), _stage("backend", backend), _stage("interpolator", interpolator)
-    plan = None
+    begun, plan = time.perf_counter(), None
+    walked: Iterable[range] = [range(64 if paths is None else paths)]
     if error is not None or seconds is not None:
         _check_plannable(error, seconds, *chosen)
         progress("pilot", 0, 1)
@@ -223,15 +225,15 @@ def run(
             scene, chosen[1], levels, error=error, seconds=seconds, grid=grid, paths=paths, bounces=bounces, seed=seed
         )
         progress("pilot", 1, 1)
-        grid, paths, bounces = plan.grid, plan.paths, plan.bounces
-    paths = 64 if paths is None else paths
+        grid, bounces = plan.grid, plan.bounces
+        walked = [range(plan.paths)] if seconds is None or paths is not None else rounds(plan, begun + seconds)
     specs = [nodes_over(field.volume, grid) for field in scene.fields]
     if bounces is None:
         bounces, left_out = enough_bounces(scene, chosen[1], seed)
     else:
         left_out = light_left_out(scene, chosen[1], bounces, seed)
     baked = bake(
-        scene, specs, levels, *chosen, paths=range(paths), bounces=bounces, seed=seed, map=map, progress=progress
+        scene, specs, levels, *chosen, paths=walked, bounces=bounces, seed=seed, map=map, progress=progress
     )
     for field, holes in zip(scene.fields, baked.holes):
         if holes:
@@ -241,10 +243,13 @@ def run(
                 "sample in reach); they show that of the nearest node",
                 stacklevel=2,
             )
+    reached = None
+    if plan is not None:
+        reached = asdict(judge(scene, chosen[1], baked.grids, seed, baked.queries * baked.paths))
     recipe = {
         **{kind: _described(stage) for kind, stage in zip(("sampler", "backend", "interpolator"), chosen)},
         "grid": max(max(spec.shape) for spec in specs),
-        "paths": paths,
+        "paths": baked.paths,
         "bounces": bounces,
         "left_out": left_out,
         "isovalues": len(levels.table),
@@ -254,7 +259,7 @@ def run(
         "seconds": {stage: round(seconds, 3) for stage, seconds in baked.seconds.items()},
         "relative_error": _relative_error(baked.grids),
         "plan": None if plan is None else asdict(plan),
-        "reached": None if plan is None else asdict(judge(scene, chosen[1], baked.grids, seed)),
+        "reached": reached,
         "versions": {name: version(name) for name in ("illumgrid", "numpy", "numba", "scipy")},
     }
     return Illumination(scene, levels, baked.grids, baked.walls, recipe)

@@ -108,8 +108,11 @@ class Measured:
 
     @property
     def floor(self) -> float:
-        """Mean squared error that no number of paths takes away."""
-        return float(max(0.0, self.split.total - self.split.noise))
+        """Mean squared error that no number of paths takes away, and one standard error more.
+
+        Where the light is rough, a few points carry the error, and a pilot misses them more often than not.
+        """
+        return float(max(0.0, self.split.total - self.split.noise) + self.split.uncertain)
 
     def squared(self, paths: int) -> float:
         """Predicted mean squared error with this many paths."""

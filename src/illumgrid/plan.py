@@ -1,7 +1,7 @@
 """No more than a scene needs: nodes, paths and bounces for an asked error or time, from a short pilot."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -31,6 +31,8 @@ class Plan:
         Predicted relative error.
     seconds : float
         Predicted time of the run.
+    fill : float
+        Seconds of those that go into queries and grids, not into paths.
     pilot : float
         Seconds that the pilot took.
     met : bool
@@ -44,6 +46,7 @@ class Plan:
     bounces: int
     error: float
     seconds: float
+    fill: float
     pilot: float
     met: bool
     why: tuple[str, ...]
@@ -82,7 +85,8 @@ def choose(
                 kept.append(choice(m, count, True))
         if kept:
             return min(kept, key=lambda c: c.seconds)
-        best = min(tried, key=lambda m: m.floor)
+        least = min(m.floor for m in tried)
+        best = min((m for m in tried if m.floor <= 1.2 * least), key=lambda m: m.nodes)  # a tenth off, no more
         return choice(best, paths or best.paths_for(1.25 * best.floor) or 64, False)
     counts = [paths or min(MOST, pace.paths_in(seconds, m.nodes + walls)) for m in tried]
     kept = [choice(m, n, True) for m, n in zip(tried, counts) if n >= FEWEST]
@@ -161,34 +165,59 @@ def planned(
     followed = pilot.bounces_for(SHARE * goal) if bounces is None else bounces
     tried = _ladder(pilot, candidates, followed, pace, error, left)
     choice = choose(tried, pace, walls, error, left, paths)
-    near = [m.grid for m in tried if 0.6 < m.grid / choice.measured.grid < 1.7]
+    # For an error every finer grid, in turn: the choice may have been so good by chance.
+    near = [size for size in candidates if 0.6 < size / choice.measured.grid < (1.7 if error is None else np.inf)]
     # A closer look around it, at more points: for a sixth of the time that the run will take, or with time to spare.
-    more = int(min(8192.0, choice.seconds / 6 / pace.path / (2 * 8 * PATHS * len(near))))
+    more = int(min(8192.0, choice.seconds / 6 / pace.path / (2 * 8 * PATHS * 3)))
     if seconds is None:
-        more = max(more, 1536)
+        more = max(more, 4096)
     if more > 1.5 * points:
         goal = choice.error if error is None else error
-        pilot = Pilot.start(scene, backend, more, goal, seed + 1)
+        # More points tell more than a sharper truth at each: its variance is subtracted.
+        pilot = Pilot.start(scene, backend, more, goal, seed + 1, 128)
         followed = pilot.bounces_for(SHARE * goal) if bounces is None else bounces
-        fewer = pilot.fewer(followed)
-        tried = [pilot.measure(size, fewer, followed, PATHS) for size in near]
+        tried = _ladder(pilot, near, followed, pace, error, left)
     pace = timed(scene, backend, choice.measured.grid, choice.paths, followed, seed)
     choice = choose(tried, pace, walls, error, left - (time.perf_counter() - begun), paths)
     return Plan(
-        choice.measured.grid, choice.paths, followed, choice.error, choice.seconds, time.perf_counter() - begun,
-        choice.met, reasons(scene, choice, followed, pilot.left_out(followed)),
+        choice.measured.grid, choice.paths, followed, choice.error, choice.seconds,
+        choice.measured.nodes * pace.node, time.perf_counter() - begun, choice.met,
+        reasons(scene, choice, followed, pilot.left_out(followed)),
     )  # fmt: skip
 
 
-def judge(scene: Scene, backend: Backend, grids: Sequence[IlluminationGrid], seed: int, points: int = 1024) -> Errors:
-    """How far grids are from light at points that neither they nor the pilot asked for, its own variance subtracted."""
+def rounds(plan: Plan, until: float, clock: Callable[[], float] = time.perf_counter) -> Iterator[range]:
+    """Paths for a run that is to end at a time: a quarter of the plan's, then as many as their pace leaves time for.
+
+    The pilot times a few thousand paths, which is good enough to choose a grid but, on a machine that does other things
+    as well, not to promise a time.
+    """
+    begun, done, more = clock(), 0, max(FEWEST, 2 * (plan.paths // 8))
+    after = plan.fill + (1 - JUDGED) * (until - begun)
+    while more >= max(2, done // 16) and done < MOST:
+        yield range(done, done + more)
+        done += more
+        now = clock()
+        more = 2 * int((until - after - now) * done / (now - begun) / 2)
+
+
+def judge(
+    scene: Scene, backend: Backend, grids: Sequence[IlluminationGrid], seed: int, walked: int = 0, points: int = 4096
+) -> Errors:
+    """How far grids are from light at points that neither they nor the pilot asked for, its own variance subtracted.
+
+    Many points with few paths: where the light is rough, a few points carry the error. The truth takes up to a
+    thirtieth of the paths that the run `walked`, and 64 a point in any case. An error that it cannot tell from none is
+    given as a third of the truth's own, the least that so many points can tell.
+    """
     bounces = enough(scene, backend, 1e-3, seed)
-    truth = begin(scene, backend, unseen_in_volume(scene, points, seed + 2), bounces, seed + 2)
+    truth = begin(scene, backend, unseen_in_volume(scene, points, seed + 2), bounces, seed + 2, paths=16)
+    most = max(64, walked // (30 * max(1, len(truth))))
     while True:
         found = errors(look_up(grids, truth.samples.queries), truth)
         paths = int(truth.samples.paths[0])
-        if truth.error <= found.rmse or paths >= 256:  # more would cost more than a small run itself
-            return found
+        if truth.error <= found.rmse or 2 * paths > most:
+            return replace(found, rmse=max(found.rmse, truth.error / 3))
         truth = converge(truth, scene, backend, seed + 2, 0.0, 2 * paths)
 
 
@@ -198,5 +227,6 @@ def helps(scene: Scene, backend: Backend, grid: int, bounces: int, seed: int) ->
     found = {}
     for what, of, nodes in (("now", scene, grid), ("finer", scene, 2 * grid), ("smooth", soft, grid)):
         pilot = Pilot.start(of, backend, 512, 0.05, seed, most=128)  # a hint: it must not cost more than the run
-        found[what] = float(np.sqrt(pilot.measure(nodes, pilot.fewer(bounces), bounces, 32).floor))
+        part = pilot.measure(nodes, pilot.fewer(bounces), bounces, 32).split
+        found[what] = float(np.sqrt(max(0.0, part.total - part.noise)))
     return found

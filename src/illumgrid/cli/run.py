@@ -232,8 +232,9 @@ def _judged(light: "Illumination", backend: Any, seed: int) -> "Illumination":
 
     if light.recipe.get("reached") or backend.geometry == "mesh":
         return light
-    found = asdict(judge(light.scene, registry.backend("auto"), light.grids, seed))
-    return replace(light, recipe={**light.recipe, "reached": found})
+    walked = light.recipe["queries"] * light.recipe["paths"]
+    found = judge(light.scene, registry.backend("auto"), light.grids, seed, walked)
+    return replace(light, recipe={**light.recipe, "reached": asdict(found)})
 
 
 def _told_help(light: "Illumination", stages: dict[str, Any]) -> None:
