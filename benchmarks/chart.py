@@ -121,7 +121,7 @@ def ways(asked):
         cases["stroke_T1, smoothed"] = Scene.sky(smooth(read_volume(place), 1.0), range=(60, 110))
     found = {}
     for name, scene in cases.items():
-        race = race_of(scene, 60 if asked.quick else 400)
+        race = race_of(scene, 60 if asked.quick else 200)
         exact = race.truths["levelset"]
         own = front([p for p in race.points if p.label == "direct, numba, nearest"], race.truths)
         times, rmse = np.log([p.time for p in own]), np.log([p.rmse(exact) for p in own])
@@ -201,7 +201,7 @@ def volumes(asked):
         if not (asked.volumes / name).exists():
             continue
         scene = Scene.sky(read_volume(asked.volumes / name), range=limits)
-        result = bench(scene, 40 if asked.quick else 150)
+        result = bench(scene, 40 if asked.quick else 80)
         content, said = report.files(result, name.split(".")[0], scene)
         (asked.json.parent / f"chart-{name.split('.')[0]}.png").write_bytes(content["chart.png"])
         light, took = timed(scene)

@@ -9,7 +9,7 @@ import pytest
 import illumgrid as ig
 from illumgrid import store
 from illumgrid.backends.numba_ import Numba
-from illumgrid.bake import bake, wall_queries
+from illumgrid.bake import WALLS, bake, wall_queries
 from illumgrid.errors import BadInput
 from illumgrid.grid import GridSpec, WallTexture
 from illumgrid.interpolators.nearest import Nearest
@@ -93,7 +93,7 @@ def test_a_wall_holds_the_light_that_a_backend_tells_of(baked):
     scene, levels, light = baked
     (wall,) = light.walls
     (queries,) = wall_queries(scene, levels)
-    answer = Numba().solve(scene, queries, paths=range(8), bounces=2, seed=0)
+    answer = Numba().solve(scene, queries, paths=range(8 * WALLS), bounces=2, seed=0)
     good = answer.paths.reshape(4, 7, 13) > 0
     np.testing.assert_array_equal(wall.support > 0, good)
     np.testing.assert_array_equal(wall.values[good], answer.mean.reshape(4, 7, 13, 3)[good])

@@ -15,6 +15,9 @@ from illumgrid.scene import Levels, Quad, Scene
 from illumgrid.stages import Backend, Interpolator, Sampler
 from illumgrid.volume import interpolate, world_to_index
 
+WALLS = 8
+"""Paths from a texel for each path from a node: texels are few, and each is seen across many pixels."""
+
 Progress = Callable[[str, int, int], None]
 """Called with what is being done, how much of it is done, and how much there is."""
 
@@ -41,7 +44,7 @@ class Baked:
     queries : int
         Number of questions asked.
     paths : int
-        Paths walked from each.
+        Paths walked from each of a field's.
     holes : tuple of int
         For each field, nodes that its isosurfaces can show and no sample supports.
     """
@@ -83,6 +86,8 @@ def _wall_texture(rows: int, quad: Quad, answer: Samples) -> WallTexture:
 
 
 def _answer(scene: Scene, backend: Backend, paths: range, bounces: int, seed: int, queries: Queries) -> Samples:
+    if queries.target[0] >= len(scene.fields):
+        paths = range(WALLS * paths.start, WALLS * paths.stop)
     return backend.solve(scene, queries, paths=paths, bounces=bounces, seed=seed)
 
 
@@ -174,7 +179,8 @@ def bake(
     sampler, backend, interpolator
         Stage objects.
     paths : iterable of range
-        Numbers of the paths from every query, one range after the other; the next is asked for when one is walked.
+        Numbers of the paths from every node, one range after the other; the next is asked for when one is walked.
+        A texel has `WALLS` times as many.
     bounces : int
     seed : int
     map : callable, optional

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from illumgrid.bake import wall_queries
+from illumgrid.bake import WALLS, wall_queries
 from illumgrid.grid import IlluminationGrid
 from illumgrid.pilot import FEWEST, MOST, Measured, Pace, Pilot, specs_of, timed
 from illumgrid.scene import Levels, Scene
@@ -154,7 +154,7 @@ def planned(
     seed : int
     """
     begun = time.perf_counter()
-    walls = sum(len(queries) for queries in wall_queries(scene, levels))
+    walls = WALLS * sum(len(queries) for queries in wall_queries(scene, levels))
     candidates = [grid] if grid else sizes(scene)
     pace = timed(scene, backend, candidates[len(candidates) // 2], 32, 4, seed)
     goal, left, points = 0.02 if error is None else error, np.inf, 384
