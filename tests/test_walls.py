@@ -9,7 +9,7 @@ import pytest
 import illumgrid as ig
 from illumgrid import store
 from illumgrid.backends.numba_ import Numba
-from illumgrid.bake import WALLS, bake, wall_queries
+from illumgrid.bake import bake, texel_paths, wall_queries
 from illumgrid.errors import BadInput
 from illumgrid.grid import GridSpec, WallTexture
 from illumgrid.interpolators.nearest import Nearest
@@ -93,12 +93,18 @@ def test_a_wall_holds_the_light_that_a_backend_tells_of(baked):
     scene, levels, light = baked
     (wall,) = light.walls
     (queries,) = wall_queries(scene, levels)
-    answer = Numba().solve(scene, queries, paths=range(8 * WALLS), bounces=2, seed=0)
+    more = texel_paths(light.queries - len(queries), len(queries))
+    answer = Numba().solve(scene, queries, paths=range(8 * more), bounces=2, seed=0)
     good = answer.paths.reshape(4, 7, 13) > 0
     np.testing.assert_array_equal(wall.support > 0, good)
     np.testing.assert_array_equal(wall.values[good], answer.mean.reshape(4, 7, 13, 3)[good])
     assert wall.values.dtype == wall.support.dtype == np.float32
     assert light.queries > len(queries)
+
+
+def test_texels_get_more_paths_while_they_are_few():
+    assert [texel_paths(nodes, 100) for nodes in (0, 100, 250, 799, 800, 10**6)] == [1, 1, 2, 7, 8, 8]
+    assert texel_paths(1000, 0) == 8  # no walls
 
 
 def test_a_texel_inside_the_solid_takes_the_nearest_one_of_the_same_row(baked):

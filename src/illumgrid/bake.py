@@ -15,9 +15,6 @@ from illumgrid.scene import Levels, Quad, Scene
 from illumgrid.stages import Backend, Interpolator, Sampler
 from illumgrid.volume import interpolate, world_to_index
 
-WALLS = 8
-"""Paths from a texel for each path from a node: texels are few, and each is seen across many pixels."""
-
 Progress = Callable[[str, int, int], None]
 """Called with what is being done, how much of it is done, and how much there is."""
 
@@ -76,6 +73,14 @@ def wall_queries(scene: Scene, levels: Levels) -> list[Queries]:
     return batches
 
 
+def texel_paths(nodes: int, texels: int) -> int:
+    """Paths from a texel for each from a node: up to eight, while the walls are no more work than the grids.
+
+    A texel is seen across many pixels, where noise that a curved surface hides shows as blotches.
+    """
+    return int(np.clip(nodes // max(texels, 1), 1, 8))
+
+
 def _wall_texture(rows: int, quad: Quad, answer: Samples) -> WallTexture:
     nu, nv = quad.texels
     support = (answer.paths > 0).astype(np.float32).reshape(rows, nv, nu)
@@ -85,9 +90,11 @@ def _wall_texture(rows: int, quad: Quad, answer: Samples) -> WallTexture:
     return WallTexture(fill_holes(spacing, answer.mean.reshape(rows, nv, nu, 3), support), support)
 
 
-def _answer(scene: Scene, backend: Backend, paths: range, bounces: int, seed: int, queries: Queries) -> Samples:
+def _answer(
+    scene: Scene, backend: Backend, paths: range, more: int, bounces: int, seed: int, queries: Queries
+) -> Samples:
     if queries.target[0] >= len(scene.fields):
-        paths = range(WALLS * paths.start, WALLS * paths.stop)
+        paths = range(more * paths.start, more * paths.stop)
     return backend.solve(scene, queries, paths=paths, bounces=bounces, seed=seed)
 
 
@@ -180,7 +187,7 @@ def bake(
         Stage objects.
     paths : iterable of range
         Numbers of the paths from every node, one range after the other; the next is asked for when one is walked.
-        A texel has `WALLS` times as many.
+        A texel has `texel_paths` times as many.
     bounces : int
     seed : int
     map : callable, optional
@@ -190,7 +197,9 @@ def bake(
     """
     clock = [time.perf_counter()]
     batches = [batch for batch in sampler.queries(scene, specs, seed) if len(batch)]
-    batches += wall_queries(scene, levels)
+    walls = wall_queries(scene, levels)
+    more = texel_paths(sum(map(len, batches)), sum(map(len, walls)))
+    batches += walls
     clock.append(time.perf_counter())
 
     total, walked = sum(len(batch) for batch in batches), 0
@@ -198,16 +207,16 @@ def bake(
     for numbers in paths:
         what, done, new = "more light" if answers else "light", 0, []
         progress(what, 0, total)
-        for answer in map(partial(_answer, scene, backend, numbers, bounces, seed), batches):
+        for answer in map(partial(_answer, scene, backend, numbers, more, bounces, seed), batches):
             new.append(answer)
             done += len(answer)
             progress(what, done, total)
-        answers = [combine(one, more) for one, more in zip(answers, new)] if answers else new
+        answers = [combine(old, now) for old, now in zip(answers, new)] if answers else new
         walked += len(numbers)
     clock.append(time.perf_counter())
 
     grids = []
-    del batches
+    del batches, walls
     for number, spec in enumerate(specs):
         samples = _of_field(scene, answers, number)
         answers = [a for a in answers if (a.queries.target != number).any()]  # a large run is held once, not twice

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from illumgrid.bake import WALLS, wall_queries
+from illumgrid.bake import texel_paths, wall_queries
 from illumgrid.grid import IlluminationGrid
 from illumgrid.pilot import FEWEST, MOST, Measured, Pace, Pilot, specs_of, timed
 from illumgrid.scene import Levels, Scene
@@ -74,8 +74,11 @@ def choose(
 ) -> Choice:
     """The least time for an error, or else the least error for a time; if neither can be had, what comes nearest."""
 
+    def work(m: Measured) -> int:
+        return m.nodes + walls * texel_paths(m.nodes, walls)
+
     def choice(m: Measured, count: int, met: bool) -> Choice:
-        return Choice(m, count, float(np.sqrt(m.squared(count))), pace.seconds(m.nodes + walls, count), met)
+        return Choice(m, count, float(np.sqrt(m.squared(count))), pace.seconds(work(m), count), met)
 
     if error is not None:
         kept = []
@@ -88,7 +91,7 @@ def choose(
         least = min(m.floor for m in tried)
         best = min((m for m in tried if m.floor <= 1.2 * least), key=lambda m: m.nodes)  # a tenth off, no more
         return choice(best, paths or best.paths_for(1.25 * best.floor) or 64, False)
-    counts = [paths or min(MOST, pace.paths_in(seconds, m.nodes + walls)) for m in tried]
+    counts = [paths or min(MOST, pace.paths_in(seconds, work(m))) for m in tried]
     kept = [choice(m, n, True) for m, n in zip(tried, counts) if n >= FEWEST]
     if kept:
         return min(kept, key=lambda c: c.error)
@@ -154,7 +157,7 @@ def planned(
     seed : int
     """
     begun = time.perf_counter()
-    walls = WALLS * sum(len(queries) for queries in wall_queries(scene, levels))
+    walls = sum(len(queries) for queries in wall_queries(scene, levels))
     candidates = [grid] if grid else sizes(scene)
     pace = timed(scene, backend, candidates[len(candidates) // 2], 32, 4, seed)
     goal, left, points = 0.02 if error is None else error, np.inf, 384
