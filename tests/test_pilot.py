@@ -7,7 +7,7 @@ from illumgrid import run
 from illumgrid.backends.numba_ import Numba
 from illumgrid.grid import IlluminationGrid
 from illumgrid.pilot import Measured, Pace, Pilot, corners
-from illumgrid.plan import choose, judge, planned, sizes
+from illumgrid.plan import Plan, choose, judge, planned, rounds, sizes
 from illumgrid.samples import Queries, Samples
 from illumgrid.scene import Scene, level_table
 from illumgrid.split import Split, split
@@ -159,6 +159,55 @@ def test_the_least_time_for_an_error_and_the_least_error_for_a_time():
         assert choice.met and choice.seconds <= seconds * 1.001
         counts = [PACE.paths_in(seconds, m.nodes) for m in tried]
         assert choice.error == min(m.squared(n) ** 0.5 for m, n in zip(tried, counts) if n >= 4)
+
+
+class Clock:
+    """A machine that walks a path in some seconds, which may change."""
+
+    def __init__(self, pace):
+        self.now, self.pace = 0.0, pace
+
+    def __call__(self):
+        return self.now
+
+    def walk(self, plan, until):
+        done = 0
+        for numbers in rounds(plan, until, self):
+            assert numbers.start == done  # one after the other, none twice
+            done = numbers.stop
+            self.now += len(numbers) * self.pace(self.now)
+        return done
+
+
+@pytest.mark.parametrize("factor", [0.2, 0.5, 1.0, 2.0, 3.0])
+def test_a_time_is_kept_whatever_the_pace(factor):
+    plan = Plan(grid=8, paths=400, bounces=4, error=0.01, seconds=8.0, fill=0.5, pilot=1.0, met=True, why=())
+    clock = Clock(lambda now: factor * 8.0 / 400)
+    done = clock.walk(plan, 10.0)
+    assert 0.85 * 9.0 <= clock.now <= 9.05 and done == pytest.approx(9.0 / clock.pace(0), rel=0.1)  # 9: the rest fills
+
+
+def test_a_machine_that_slows_down_is_late_by_what_it_slowed_last():
+    plan = Plan(grid=8, paths=400, bounces=4, error=0.01, seconds=8.0, fill=0.0, pilot=1.0, met=True, why=())
+    clock = Clock(lambda now: 0.02 if now < 5 else 0.03)
+    clock.walk(plan, 10.0)
+    assert 8.5 <= clock.now <= 12.5
+    late = Clock(lambda now: 1.0)  # the fewest paths take longer than there is time
+    assert late.walk(plan, 10.0) == 100
+
+
+def test_the_pilot_of_an_error_climbs_to_finer_grids_where_its_first_choice_will_not_do(monkeypatch):
+    """The first look sees few points, and may find a grid good enough by chance."""
+    scene, looks = FIELDS["few bumps"](), []
+
+    def lucky(pilot, grid, fewer, bounces, paths):
+        looks.append((len(pilot.truth), grid))
+        first = looks[0][0] == len(pilot.truth)
+        return measured(grid, 0.001 if first or grid >= 20 else 0.1, nodes=grid**3)
+
+    monkeypatch.setattr(Pilot, "measure", lucky)
+    plan = planned(scene, BACKEND, level_table(scene, 4), error=0.02, seed=0)
+    assert plan.met and plan.grid >= 20
 
 
 def test_what_cannot_be_had_is_said():
