@@ -90,7 +90,7 @@ def promises(asked):
                 ratio = reached / value if option == "error" else seconds / value
                 found.append(
                     {"field": name, option: value, "ratio": ratio, "rmse": reached, "took": seconds, "plan": plan,
-                     "judged": light.recipe["reached"]["rmse"]}
+                     "judged": light.recipe["reached"]}
                 )  # fmt: skip
                 chosen = f"grid {plan['grid']}, {plan['paths']} paths, met {plan['met']}"
                 came = f"{reached:7.2%} in {seconds:6.1f} s, ratio {ratio:5.2f}"

@@ -192,7 +192,7 @@ def test_run_tells_the_error_that_it_reached_and_what_it_chose(call, tmp_path):
     said = call("run", "v.npy", "--range", 0.3, 0.9, "--error", 0.1, "--no-preview", "-o", "e")
     assert "nodes along the longest axis" in said and "error reached" in said and "the pilot said" in said
     recipe = json.loads((tmp_path / "e" / "run.json").read_text("utf-8"))["recipe"]
-    assert recipe["plan"]["why"] and recipe["reached"]["rmse"] < 0.13
+    assert recipe["plan"]["why"] and recipe["reached"] < 0.13
     assert "error reached" in call("run", "v.npy", "--range", 0.3, 0.9, "--grid", 5, "--no-preview", "-o", "plain")
 
 

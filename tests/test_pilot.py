@@ -244,7 +244,7 @@ def test_an_asked_error_is_met_nine_times_in_ten(truths):
 def test_the_judgement_agrees_with_a_truth(truths):
     scene, truth = truths["labyrinth"]
     light = run(scene, grid=14, paths=16, seed=0)
-    assert judge(scene, BACKEND, light.grids, 0).rmse == pytest.approx(off(light, scene, truth), rel=0.2)
+    assert judge(scene, BACKEND, light.grids, 0, 10**9) == pytest.approx(off(light, scene, truth), rel=0.2)
 
 
 def test_run_tells_what_it_chose_and_what_it_reached():
@@ -252,7 +252,7 @@ def test_run_tells_what_it_chose_and_what_it_reached():
     recipe = run(scene, error=0.05, seed=0).recipe
     assert recipe["plan"]["met"] and recipe["grid"] == recipe["plan"]["grid"]
     assert recipe["paths"] == recipe["plan"]["paths"] and len(recipe["plan"]["why"]) == 4
-    assert recipe["reached"]["rmse"] <= 1.3 * 0.05
+    assert recipe["reached"] <= 1.3 * 0.05
     kept = run(scene, seconds=1.0, grid=12, bounces=3, seed=0).recipe
     assert kept["grid"] == 12 and kept["bounces"] == 3
     assert run(scene, grid=8, paths=2, bounces=1).recipe["plan"] is None

@@ -55,4 +55,4 @@ class Preset:
     isovalues: int
 
 
-SCENES = {"nucleus": Preset(nucleus, grid=28, paths=96, isovalues=5)}
+SCENES = {"nucleus": Preset(nucleus, grid=28, paths=64, isovalues=5)}

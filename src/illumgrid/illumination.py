@@ -245,7 +245,7 @@ def run(
             )
     reached = None
     if plan is not None:
-        reached = asdict(judge(scene, chosen[1], baked.grids, seed, baked.queries * baked.paths))
+        reached = judge(scene, chosen[1], baked.grids, seed, baked.queries * baked.paths * (bounces + 1))
     recipe = {
         **{kind: _described(stage) for kind, stage in zip(("sampler", "backend", "interpolator"), chosen)},
         "grid": max(max(spec.shape) for spec in specs),

@@ -11,7 +11,7 @@ from illumgrid.grid import IlluminationGrid
 from illumgrid.pilot import FEWEST, MOST, Measured, Pace, Pilot, specs_of, timed
 from illumgrid.scene import Levels, Scene
 from illumgrid.stages import Backend
-from illumgrid.truth import Errors, begin, converge, enough, errors, look_up, unseen_in_volume
+from illumgrid.truth import begin, converge, enough, errors, look_up, unseen_in_volume
 from illumgrid.volume import smooth
 
 SHARE = 0.25  # of the asked error that the bounces left out may be
@@ -204,24 +204,22 @@ def rounds(plan: Plan, until: float, clock: Callable[[], float] = time.perf_coun
         more = 2 * int((until - after - now) * done / (now - begun) / 2)
 
 
-def judge(
-    scene: Scene, backend: Backend, grids: Sequence[IlluminationGrid], seed: int, walked: int = 0, points: int = 4096
-) -> Errors:
-    """How far grids are from light at points that neither they nor the pilot asked for, its own variance subtracted.
+def judge(scene: Scene, backend: Backend, grids: Sequence[IlluminationGrid], seed: int, work: int) -> float:
+    """Relative RMS error of grids at points that neither they nor the pilot asked for, the truth's own subtracted.
 
-    Many points with few paths: where the light is rough, a few points carry the error. The truth takes up to a
-    thirtieth of the paths that the run `walked`, and 64 a point in any case. An error that it cannot tell from none is
-    given as a third of the truth's own, the least that so many points can tell.
+    Many points with few paths, for where the light is rough a few points carry the error; up to a twentieth of the
+    `work`, the reflections that the run followed, or what 512 points take. An error that the truth cannot tell from
+    none is given as a third of the truth's own, the least that so many points can tell.
     """
     bounces = enough(scene, backend, 1e-3, seed)
-    truth = begin(scene, backend, unseen_in_volume(scene, points, seed + 2), bounces, seed + 2, paths=16)
-    most = max(64, walked // (30 * max(1, len(truth))))
+    points, paths = int(np.clip(work / (20 * 16 * (bounces + 1)), 512, 4096)), 16
+    truth = begin(scene, backend, unseen_in_volume(scene, points, seed + 2), bounces, seed + 2, paths)
     while True:
-        found = errors(look_up(grids, truth.samples.queries), truth)
-        paths = int(truth.samples.paths[0])
-        if truth.error <= found.rmse or 2 * paths > most:
-            return replace(found, rmse=max(found.rmse, truth.error / 3))
-        truth = converge(truth, scene, backend, seed + 2, 0.0, 2 * paths)
+        found = errors(look_up(grids, truth.samples.queries), truth).rmse
+        paths *= 2
+        if truth.error <= found or 20 * points * paths * (bounces + 1) > work:
+            return max(found, truth.error / 3)
+        truth = converge(truth, scene, backend, seed + 2, 0.0, paths)
 
 
 def helps(scene: Scene, backend: Backend, grid: int, bounces: int, seed: int) -> dict[str, float]:

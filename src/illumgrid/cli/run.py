@@ -225,16 +225,14 @@ def _why_auto() -> str:
 
 def _judged(light: "Illumination", backend: Any, seed: int) -> "Illumination":
     """With the error that was reached, where the backend can tell it at points that each have a level set."""
-    from dataclasses import asdict
-
     from illumgrid import registry
     from illumgrid.plan import judge
 
     if light.recipe.get("reached") or backend.geometry == "mesh":
         return light
-    walked = light.recipe["queries"] * light.recipe["paths"]
-    found = judge(light.scene, registry.backend("auto"), light.grids, seed, walked)
-    return replace(light, recipe={**light.recipe, "reached": asdict(found)})
+    work = light.recipe["queries"] * light.recipe["paths"] * (light.recipe["bounces"] + 1)
+    found = judge(light.scene, registry.backend("auto"), light.grids, seed, work)
+    return replace(light, recipe={**light.recipe, "reached": found})
 
 
 def _told_help(light: "Illumination", stages: dict[str, Any]) -> None:
@@ -245,7 +243,7 @@ def _told_help(light: "Illumination", stages: dict[str, Any]) -> None:
     if (stages["sampler"].name, stages["interpolator"].name) != ("direct", "nearest") or not recipe.get("reached"):
         return
     noise = max((e or 0.0 for e in recipe["relative_error"]), default=0.0)
-    if recipe["reached"]["rmse"] < max(0.05, 1.5 * noise):
+    if recipe["reached"] < max(0.05, 1.5 * noise):
         return
     found = helps(light.scene, stages["backend"], recipe["grid"], recipe["bounces"], recipe["seed"])
     told = f"between the nodes the light is off by about {found['now']:.1%}, whatever the paths"
@@ -267,5 +265,5 @@ def _told_result(light: "Illumination", folder: Path, seconds: float, picture: b
     say(f"{recipe['queries']} queries x {recipe['paths']} paths in {seconds:.1f} s{noise}{told_left_out(recipe)}")
     if reached:
         asked = f"; the pilot said {plan['error']:.2%}" if plan else ""
-        say(f"error reached: {reached['rmse']:.2%} of the mean light (median {reached['median']:.2%}){asked}")
+        say(f"error reached: {reached:.2%} of the mean light{asked}")
     say(f"wrote {folder}" + (f"; look at {folder / 'preview.png'}" if picture else ""))
