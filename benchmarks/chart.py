@@ -123,12 +123,13 @@ def ways(asked):
     for name, scene in cases.items():
         race = race_of(scene, 60 if asked.quick else 200)
         exact = race.truths["levelset"]
-        own = front([p for p in race.points if p.label == "direct, numba, nearest"], race.truths)
+        lanes = {}
+        for p in race.points:
+            lanes.setdefault(f"{p.way.sampler.name}, {p.interpolator.name}", []).append(p)
+        best_of = {label: front(points, race.truths) for label, points in sorted(lanes.items())}
+        own = best_of["direct, nearest"]
         times, rmse = np.log([p.time for p in own]), np.log([p.rmse(exact) for p in own])
-        for label in sorted({p.label.split(",")[0].split()[0] + ", " + p.interpolator.name for p in race.points}):
-            sampler, filler = label.split(", ")
-            theirs = [p for p in race.points if p.way.sampler.name == sampler and p.interpolator.name == filler]
-            best = front(theirs, race.truths)
+        for label, best in best_of.items():
             # What direct takes for the error of each of their points, read off its own front.
             ratios = [
                 float(p.time / np.exp(np.interp(-np.log(p.rmse(exact)), -rmse, times)))

@@ -152,9 +152,9 @@ def light_left_out(scene: Scene, backend: Backend, bounces: int, seed: int = 0) 
 
 
 def enough_bounces(scene: Scene, backend: Backend, seed: int = 0) -> tuple[int, float]:
-    """Reflections to follow, and the share of light left out: 4 under a sky, in a closed scene until below 1 %."""
+    """Reflections to follow, and the share of light left out: below 1 %, and at least 4 reflections."""
     bounces, left_out = 4, light_left_out(scene, backend, 4, seed)
-    while not scene.background.any() and bounces < 128 and left_out >= 0.01:
+    while bounces < 128 and left_out >= 0.01:
         bounces += max(1, bounces // 4)
         left_out = light_left_out(scene, backend, bounces, seed)
     return bounces, left_out

@@ -208,8 +208,7 @@ def judge(scene: Scene, backend: Backend, grids: Sequence[IlluminationGrid], see
     """Relative RMS error of grids at points that neither they nor the pilot asked for, the truth's own subtracted.
 
     Many points with few paths, for where the light is rough a few points carry the error; up to a twentieth of the
-    `work`, the reflections that the run followed, or what 512 points take. An error that the truth cannot tell from
-    none is given as a third of the truth's own, the least that so many points can tell.
+    `work`, the reflections that the run followed, or what 512 points take.
     """
     bounces = enough(scene, backend, 1e-3, seed)
     points, paths = int(np.clip(work / (20 * 16 * (bounces + 1)), 512, 4096)), 16
@@ -218,7 +217,7 @@ def judge(scene: Scene, backend: Backend, grids: Sequence[IlluminationGrid], see
         found = errors(look_up(grids, truth.samples.queries), truth).rmse
         paths *= 2
         if truth.error <= found or 20 * points * paths * (bounces + 1) > work:
-            return max(found, truth.error / 3)
+            return found
         truth = converge(truth, scene, backend, seed + 2, 0.0, paths)
 
 

@@ -71,7 +71,8 @@ class Errors:
     Parameters
     ----------
     rmse : float
-        Root mean square over points and colours, the truth's own variance subtracted.
+        Root mean square over points and colours, the truth's own variance subtracted; at least a third of the truth's
+        own error, since less could not be told from none.
     median, p95 : float
         Median and 95th percentile over points of the root mean square over colours.
     bias : float
@@ -174,7 +175,7 @@ def errors(light: Floats, truth: Truth) -> Errors:
     off = (light - truth.light) / truth.mean
     each = np.sqrt((off**2).mean(axis=1))
     return Errors(
-        rmse=float(np.sqrt(max(0.0, (off**2).mean() - truth.error**2))),
+        rmse=float(np.sqrt(max(truth.error**2 / 9, (off**2).mean() - truth.error**2))),
         median=float(np.median(each)),
         p95=float(np.quantile(each, 0.95)),
         bias=float(off.mean()),

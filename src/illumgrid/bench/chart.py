@@ -19,17 +19,23 @@ PARTS = {
     "bounces": ("bounces left out", "#e0a030"),
 }
 SHOWN = 10
-"""Contestants with a colour and a name of their own; the others are grey."""
+"""Contestants with a colour of their own; the others are grey."""
+
+COLUMNS = 4
+"""Of the legend."""
 
 
 def draw(records: Sequence[dict[str, Any]], bars: Sequence[Bar], title: str) -> "Figure":
     """Figure with the race on the left, and where the error of the direct way comes from on the right."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(13, 6), layout="constrained")
+    rows = -(-(len({r["contestant"] for r in records}) + 1) // COLUMNS)
+    figure = Figure(figsize=(13, 6 + 0.17 * rows), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=(1.55, 1))
     race(left, records)
     parts(right, bars)
+    handles, names = left.get_legend_handles_labels()  # below both: however many there are, they hide nothing
+    figure.legend(handles, names, loc="outside lower center", ncols=COLUMNS, fontsize=8, frameon=False)
     figure.suptitle(title, fontsize=12)
     return figure
 
@@ -64,7 +70,6 @@ def race(axes: "Axes", records: Sequence[dict[str, Any]]) -> None:
         axis.set_minor_formatter(NullFormatter())
     axes.grid(True, which="both", color="#eeeeee", linewidth=0.8)
     axes.set_axisbelow(True)
-    axes.legend(fontsize=8, loc="lower left", framealpha=0.9)  # below the front nobody is
 
 
 def labelled(axes: "Axes", front: Sequence[dict[str, Any]]) -> None:

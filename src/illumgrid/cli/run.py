@@ -134,21 +134,21 @@ def run(
     ] = None,
     backend: Annotated[str, typer.Option(help="Light transport: auto, numba, reference.")] = "auto",
     paths: Annotated[
-        int | None, typer.Option(min=1, metavar="N", help="Light paths from every query. [default: 64]")
+        int | None, typer.Option(min=1, metavar="N", help="Light paths from every query. [default: 32]")
     ] = None,
     bounces: Annotated[
         int | None,
         typer.Option(
             min=0,
             metavar="N",
-            help="Reflections. [default: 4 under an open sky; in a closed scene until under 1 % is left out]",
+            help="Reflections. [default: until under 1 % is left out, at least 4]",
         ),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, max=2**64 - 1, metavar="N", help="Equal seeds give equal light.")] = 0,
     interpolator: Annotated[str, typer.Option(help="From samples to nodes: nearest, splat, rbf.")] = "nearest",
     grid: Annotated[
         int | None,
-        typer.Option(min=2, metavar="N", help="Nodes along the longest axis. [default: as voxels, at most 128]"),
+        typer.Option(min=2, metavar="N", help="Nodes along the longest axis. [default: 1.2 a voxel, at most 150]"),
     ] = None,
     surroundings: Annotated[
         str | None,
