@@ -49,13 +49,16 @@ def writing(folder, process):
 
 
 def durations(folder):
-    """Seconds from start to writing, and of writing, of a run that nobody kills."""
+    """Seconds from start to writing, of writing, and from there to the end, of a run that nobody kills."""
     begun = time.perf_counter()
     process = start(folder, OLD)
     writing(folder, process)
     at = time.perf_counter()
+    while hidden(folder):
+        time.sleep(STEP)
+    over = time.perf_counter()
     assert process.wait() == 0
-    return at - begun, time.perf_counter() - at
+    return at - begun, over - at, time.perf_counter() - over
 
 
 def same(out, light):
@@ -78,13 +81,13 @@ def kill(folder, finished, lights, chance, durations, late):
     out = folder / "out"
     if finished:
         shutil.copytree(finished, out)
-    before, during = durations
+    before, during, after = durations
     process = start(folder, NEW)
     if late:
         writing(folder, process)
         time.sleep(chance.uniform(0, during))
     else:
-        time.sleep(chance.uniform(0, before + during))
+        time.sleep(chance.uniform(0, before + during + after))
     process.send_signal(signal.SIGKILL)
     ended = process.wait()
     seed, left = whole(out, lights), hidden(folder, ".")
@@ -125,7 +128,8 @@ def main():
             lights[seed] = ig.load(place / "out")
         shutil.copytree(place / "out", place / "kept")
         times = durations(place)
-        print(f"a run takes {times[0]:.2f} s before it writes and {times[1]:.3f} s from there", flush=True)
+        told = "before it writes, {:.3f} s while it writes and {:.2f} s from there to its end".format(*times[1:])
+        print(f"a run takes {times[0]:.2f} s {told}", flush=True)
         for number in range(asked.kills):
             over, late = number % 2 == 1, number // 2 % 2 == 1
             folder = Path(work) / str(number)

@@ -216,5 +216,5 @@ def test_one_warning_is_switched_off_by_its_name(recwarn):
 
 
 def test_every_warning_stands_on_its_page():
-    page = (Path(__file__).parents[1] / "docs" / "stability.md").read_text()
+    page = (Path(__file__).parents[1] / "docs" / "stability.md").read_text(encoding="utf-8")
     assert all(f"| `{name}` |" in page for name in WARNINGS)

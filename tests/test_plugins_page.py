@@ -14,7 +14,7 @@ import illumgrid as ig
 from illumgrid import registry, stages
 from shapes import sky
 
-PAGE = (Path(__file__).parents[1] / "docs" / "plugins.md").read_text()
+PAGE = (Path(__file__).parents[1] / "docs" / "plugins.md").read_text(encoding="utf-8")
 MODULES = {name: code for code, name in re.findall(r"```python\n(# (\w+)\.py\n.*?)```", PAGE, re.DOTALL)}
 
 

@@ -183,7 +183,7 @@ real = pytest.mark.skipif(not VOLUMES.is_dir(), reason=f"the real volumes are no
 def table():
     if not VOLUMES.is_dir():
         return []
-    lines = (VOLUMES / "SOURCES.md").read_text().splitlines()
+    lines = (VOLUMES / "SOURCES.md").read_text(encoding="utf-8").splitlines()
     rows = [[cell.strip() for cell in line.split("|")[1:]] for line in lines]
     return [row[:5] for row in rows if row and (VOLUMES / row[0]).is_file()]
 

@@ -157,7 +157,7 @@ def test_constant_values_have_no_isosurface(inside):
 
 def known_isovalues():
     """Isovalues worth seeing, by file, from the table of SOURCES.md: only plain ranges such as 40-200."""
-    rows = (VOLUMES / "SOURCES.md").read_text().splitlines()
+    rows = (VOLUMES / "SOURCES.md").read_text(encoding="utf-8").splitlines()
     cells = [[c.strip() for c in row.split("|")[1:-1]] for row in rows if row.startswith("|")]
     column = cells[0].index("isovalues")
     return {row[0]: [tuple(map(float, r)) for r in re.findall(r"([\d.]+)-([\d.]+)", row[column])] for row in cells[2:]}
