@@ -149,7 +149,7 @@ def test_the_chart_can_be_drawn_of_one_point_and_of_many(truth):
         figure = chart.draw(some, BARS, "a ball")
         left, right = figure.axes
         assert left.get_xscale() == left.get_yscale() == "log" and "seconds" in left.get_xlabel()
-        assert "direct, numba (levelset), nearest" in [t.get_text() for t in left.get_legend().get_texts()]
+        assert "direct, numba (levelset), nearest" in [t.get_text() for t in figure.legends[0].get_texts()]
         heights = [sum(bars[k].get_height() for bars in right.containers if hasattr(bars, "patches")) for k in range(3)]
         np.testing.assert_allclose(
             heights, [100 * np.sqrt(sum(vars(b.split).values()) - 1e-6) for b in BARS], rtol=1e-3

@@ -92,6 +92,20 @@ def test_a_kill_at_any_moment_leaves_a_whole_run_or_none(folder):
         assert ig.load(folder / "first").recipe["seed"] in range(number + 2)
 
 
+@pytest.mark.parametrize("overwrite", [(), ("--overwrite",)])
+def test_of_two_runs_into_one_folder_one_wins_and_the_other_is_told(folder, overwrite):
+    args = ("run", "v.npy", "--range", "0.3", "0.9", "--grid", "6", "--paths", "2", "--no-preview", "-o", "out")
+    both = [start(*args, "--seed", str(seed), *overwrite, cwd=folder, said=subprocess.PIPE) for seed in (0, 1)]
+    said = [process.communicate(timeout=120)[1].splitlines()[-1] for process in both]
+    codes = [process.returncode for process in both]
+    winners = [seed for seed in (0, 1) if codes[seed] == 0]
+    assert sorted(codes) == [0, 2] or (overwrite and codes == [0, 0]), said
+    for code, last in zip(codes, said):
+        assert last == "wrote out" if code == 0 else last.startswith("illumgrid: ") and last.endswith("with -o"), said
+    assert ig.load(folder / "out").recipe["seed"] in winners
+    assert sorted(p.name for p in folder.iterdir()) == ["out", "v.npy"]
+
+
 @pytest.mark.parametrize(
     "trouble, code, word",
     [

@@ -153,7 +153,7 @@ def test_smoothing_by_nothing_changes_nothing_and_by_more_calms():
 
 @pytest.mark.parametrize("sigma", [-1, np.nan, np.inf])
 def test_smoothing_by_what_is_no_width_is_refused(sigma):
-    refused(lambda: smooth(noise(), sigma), f"{sigma}", "from 0 up")
+    refused(lambda: smooth(noise(), sigma), f"{sigma}", "from 0 to")
 
 
 # Between the voxels

@@ -9,6 +9,8 @@ from numpy.typing import ArrayLike, NDArray
 from illumgrid.errors import BadInput
 from illumgrid.volume import ON_A_VOXEL, Floats, Lattice, index_to_world, placement
 
+MOST_NODES = 2**16  # along an axis: such a cube is beyond any memory, and its number of nodes still fits 64 bits
+
 
 @dataclass(frozen=True, eq=False)
 class GridSpec:
@@ -44,8 +46,11 @@ class GridSpec:
 
         Axis i gets max(2, 1 + round((n_i - 1)(longest - 1)/(n_max - 1))) nodes: `longest` = n_max gives the voxels.
         """
-        if longest < 2:
-            raise BadInput(f"a grid of {longest} nodes was asked for; expected at least 2 along the longest axis")
+        if not 2 <= longest <= MOST_NODES:
+            raise BadInput(
+                f"a grid of {longest} nodes was asked for; expected at least 2 and at most {MOST_NODES} along the "
+                "longest axis"
+            )
         voxels = np.array(lattice.shape)
         # floor(x + 1/2): Python and NumPy round halves to even, which is not what a reader of the formula expects.
         nodes = np.maximum(2, 1 + np.floor((voxels - 1) * (longest - 1) / (voxels.max() - 1) + 0.5).astype(int))

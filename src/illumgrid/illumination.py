@@ -209,10 +209,10 @@ def run(
     IllumgridWarning
         When nodes within the range are holes.
     """
-    if paths is not None and paths < 1:
-        raise BadInput(f"{paths} paths were asked for; expected at least 1")
-    if bounces is not None and bounces < 0:
-        raise BadInput(f"{bounces} bounces were asked for; expected 0 (light straight from the lamps) or more")
+    if paths is not None and not 1 <= paths < 2**31:
+        raise BadInput(f"{paths} paths were asked for; expected at least 1 and fewer than 2**31")
+    if bounces is not None and not 0 <= bounces < 2**31:
+        raise BadInput(f"{bounces} bounces were asked for; expected 0 (light straight from the lamps) to 2**31 - 1")
     if not 0 <= seed < 2**64:
         raise BadInput(f"the seed is {seed}; expected a whole number from 0 to 2**64 - 1")
     levels = level_table(scene, 32 if isovalues is None else isovalues)

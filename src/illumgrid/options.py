@@ -9,7 +9,7 @@ from typing import Any, Literal, NoReturn, get_args, get_origin, get_type_hints
 
 from illumgrid.errors import BadInput
 
-_NUMBERS = {int: "a whole number", float: "a number"}
+_NUMBERS = {int: "a whole number of 32 bits", float: "a number"}
 
 
 @dataclass(frozen=True)
@@ -20,7 +20,7 @@ class Option:
     ----------
     name : str
     type : type
-        bool, int, float, str, a Literal of words, or a tuple of numbers.
+        bool, int (of 32 bits), float, str, a Literal of words, or a tuple of numbers.
     default : object
     meaning : str
         What the class's docstring says of it, in one line.
@@ -94,7 +94,7 @@ def _value(text: str, kind: Any) -> Any:
     if kind is bool:
         return {"true": True, "false": False}[text.lower()] if text.lower() in ("true", "false") else _refuse()
     if kind is int:
-        return int(text)
+        return int(text) if abs(int(text)) < 2**31 else _refuse()  # counts: NumPy and the kernels take no more
     if kind is float:
         return float(text) if not math.isnan(float(text)) else _refuse()
     parts = get_args(kind)

@@ -119,7 +119,8 @@ class Field:
         volume = finite(self.volume, self.inside)
         asked = suggest_range(volume, self.inside)[:2] if self.range is None else self.range
         limits = np.array(asked, dtype=float)
-        if limits.shape != (2,) or not np.isfinite(limits).all() or not limits[0] < limits[1]:
+        largest = np.finfo(np.float32).max  # of any value of a volume
+        if limits.shape != (2,) or not -largest <= limits[0] < limits[1] <= largest:
             raise BadInput(
                 f"the range of field {self.name!r} is {np.asarray(asked).tolist()}; expected a low and a high isovalue"
             )
@@ -320,10 +321,13 @@ class Scene:
         return names.index(name)
 
 
+MOST_LEVELS = 2**20  # rows of a level table: far more than any grid tells apart
+
+
 def level_table(scene: Scene, count: int) -> Levels:
     """`count` equal steps of the common sweep, both ends included."""
-    if count < 2:
-        raise BadInput(f"{count} isovalues were asked for; expected at least 2")
+    if not 2 <= count <= MOST_LEVELS:
+        raise BadInput(f"{count} isovalues were asked for; expected at least 2 and at most {MOST_LEVELS}")
     return Levels(scene.levels(np.linspace(0.0, 1.0, count)))
 
 

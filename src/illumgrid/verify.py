@@ -185,8 +185,8 @@ def check(
     Row
         As soon as it is judged. Right answers get a row that disagrees once in a thousand tables.
     """
-    if paths < 1:
-        raise BadInput(f"{paths} paths were asked for; expected at least 1")
+    if not 1 <= paths < 2**31:
+        raise BadInput(f"{paths} paths were asked for; expected at least 1 and fewer than 2**31")
     stages = contenders() if backends is None else _named(backends)
     cases = [make() for make in CASES] if cases is None else cases
     level = _FALSE_ALARM / 2  # one half for the means, one for the single queries

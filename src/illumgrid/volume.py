@@ -153,8 +153,9 @@ def finite(volume: Volume, inside: Side) -> Volume:
 
 def smooth(volume: Volume, sigma: float) -> Volume:
     """Blur by a Gaussian of `sigma` voxels (for noisy data); 0 changes nothing."""
-    if not (np.isfinite(sigma) and sigma >= 0):
-        raise BadInput(f"smoothing by {sigma} voxels; expected a number from 0 up")
+    longest = max(volume.shape)
+    if not 0 <= sigma <= longest:  # a blur beyond that leaves nothing, and its kernel may exceed any memory
+        raise BadInput(f"smoothing by {sigma} voxels; expected a number from 0 to {longest}, the longest axis")
     if sigma == 0:
         return volume
     from scipy.ndimage import gaussian_filter

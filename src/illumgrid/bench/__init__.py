@@ -57,6 +57,9 @@ def sizes(scene: Scene) -> list[int]:
     return sorted({max(4, round(longest * share)) for share in (0.25, 0.5, 1.0, 2.0)})
 
 
+LONGEST = 1e7  # seconds of a budget: four months; counts of paths in proportion to it stay whole numbers
+
+
 def _unseen(scene: Scene, budget: float, seed: int) -> Queries:
     """Points of the truth: as many level sets as a small share of the budget allows, of forty to a hundred points."""
     begun = time.perf_counter()
@@ -100,8 +103,11 @@ def bench(
     BadInput
         On a budget that is not positive, or a scene without surface or light.
     """
-    if not 0 < budget < np.inf:
-        raise BadInput(f"a budget of {budget:g} seconds was asked for; expected a positive number, such as 60")
+    if not 0 < budget <= LONGEST:
+        raise BadInput(
+            f"a budget of {budget:g} seconds was asked for; expected a positive number of at most {LONGEST:g}, such as "
+            "60"
+        )
     auto = registry.backend("auto")
     light_left_out(scene, auto, 0)  # compiles
     begun = time.perf_counter()

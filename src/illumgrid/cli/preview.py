@@ -79,6 +79,11 @@ def preview(
             picture = _drawn(light, field, local, split, options)(isovalue)
         store.write_file(output, pictures.png(picture))
         wrote = f"wrote {output}"
+    if trust:
+        from illumgrid.preview.trust import doubts
+
+        for doubt in doubts(light):
+            say(f"note: {doubt}")
     say(wrote + ("" if local or trust else f" at exposure {light.exposure:.4g}"))
     if engine == "auto":
         say(f"drawn by the engine {drawn_by}: {why}")

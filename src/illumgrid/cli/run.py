@@ -44,7 +44,7 @@ def _input(
     from illumgrid.demo import SCENES
     from illumgrid.readers import volume_name
 
-    name = source or "nucleus"
+    name = "nucleus" if source is None else source
     preset = SCENES.get(name) if source is None or not Path(source).exists() else None
     if preset or name.lower().endswith(".toml"):
         if extra := _given(scene=surroundings, range=limits, inside=inside, albedo=albedo):
@@ -211,7 +211,12 @@ def run(
             )  # fmt: skip
             light = _judged(light, stages["backend"], seed)
         _told_help(light, stages)
-    recipe = {**light.recipe, "input": source or given.name, "smooth": smooth or 0.0, "warnings": sentences}
+    recipe = {
+        **light.recipe,
+        "input": given.name if source is None else source,
+        "smooth": smooth or 0.0,
+        "warnings": sentences,
+    }
     replace(light, recipe=recipe).save(folder, preview=not no_preview, overwrite=overwrite)
     _told_result(light, folder, time.perf_counter() - begun, picture=not no_preview)
 

@@ -1,7 +1,7 @@
 """Pictures: an isosurface lit by a lookup, by OpenGL where there is one, else marched in software."""
 
 import io
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,7 +12,7 @@ from illumgrid.preview import gl, meshes, software
 from illumgrid.preview.block import Block
 from illumgrid.preview.camera import VIEWS, Camera, View, camera_around, corners, fit_camera, widest_row
 from illumgrid.preview.shade import BACKGROUND, CAP_TONE, Colors, Shown
-from illumgrid.preview.trust import with_scale
+from illumgrid.preview.trust import scale
 from illumgrid.tone import decode_srgb, encode_srgb
 
 if TYPE_CHECKING:
@@ -96,7 +96,8 @@ def render(
     local : bool
         Light by a lamp at the camera only, for comparison.
     trust : bool
-        In place of light its relative error bar, with a scale; holes are hatched.
+        In place of light its relative error bar, with a scale below; holes are hatched, walls and caps, which have no
+        bar, are grey.
     view : str or (azimuth, elevation), optional
         A name of `VIEWS`, or degrees to the right of the front and upwards.
     zoom : float
@@ -115,15 +116,16 @@ def render(
     """
     drawn_by, _ = choose_engine(engine)
     sheet = _Sheet(width, height, _background(background))
+    below = [scale(light, width, height, encode_srgb(sheet.background))] if trust else []
+    sheet = replace(sheet, height=height - sum(map(len, below)))
     scene = light.scene
     number = 0 if field is None else scene.number_of(field)
     row = scene.levels(0.5)[0] if isovalue is None else scene.levels_through(number, isovalue)[0]
     low, high = scene.fields[number].range
     shown = Shown(light, row, float(np.clip((row[number] - low) / (high - low), 0.0, 1.0)), local, trust)
     if camera is None:
-        camera = fit_camera(scene, row, width / height, view, zoom)
-    picture = encode_srgb(_drawn(shown, camera, sheet, drawn_by))
-    return with_scale(picture, light) if trust else picture
+        camera = fit_camera(scene, row, sheet.width / sheet.height, view, zoom)
+    return np.concatenate([encode_srgb(_drawn(shown, camera, sheet, drawn_by)), *below])
 
 
 def _drawn(shown: Shown, camera: Camera, sheet: _Sheet, engine: str) -> Colors:

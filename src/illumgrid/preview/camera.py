@@ -102,6 +102,9 @@ def widest_row(scene: Scene) -> Floats:
     return np.array([f.range[0] if f.inside == "above" else f.range[1] for f in scene.fields])
 
 
+ZOOM = 1e6  # the largest: beyond it, and below its inverse, nothing is seen, and tangents overflow
+
+
 def fit_camera(scene: Scene, row: Floats, aspect: float, view: View = None, zoom: float = 1.0) -> Camera:
     """Camera that looks at the solids under one row of levels and just holds them.
 
@@ -130,8 +133,8 @@ def fit_camera(scene: Scene, row: Floats, aspect: float, view: View = None, zoom
 
 def camera_around(outline: Floats, direction: Floats, aspect: float, view: View, zoom: float = 1.0) -> Camera:
     """Camera that just holds world points (m, 3), seen from `view` in the axes of an array with this `direction`."""
-    if not (np.isfinite(zoom) and zoom > 0):
-        raise BadInput(f"the zoom is {zoom}; expected a positive number: 2 shows all twice as large")
+    if not 1 / ZOOM <= zoom <= ZOOM:
+        raise BadInput(f"the zoom is {zoom}; expected a positive number up to {ZOOM:g}: 2 shows all twice as large")
     azimuth, elevation = np.radians(angles("front" if view is None else view))
     side, front, up = upright(direction)
     forward = -np.cos(elevation) * (np.cos(azimuth) * front + np.sin(azimuth) * side) - np.sin(elevation) * up

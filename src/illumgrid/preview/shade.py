@@ -60,12 +60,16 @@ class Shown:
 
     def cap(self, number: int) -> Colors:
         """Colour (3,) of the cuts through the solid of a field."""
+        if self.trust:
+            return np.full(3, CAP_TONE, np.float32)
         return (CAP_TONE * self.scene.fields[number].material.albedo).astype(np.float32)
 
     def wall(self, number: int, u: Floats, v: Floats, facing: Floats) -> Colors:
         """Colours (n, 3) of the front of a quad at shares u, v (n,) of its edges."""
         material = self.scene.quads[number].material
-        if self.local or self.trust:
+        if self.trust:  # no bar is known there: no colour that could be taken for one
+            return _headlit(np.full(3, CAP_TONE), facing)
+        if self.local:
             return np.float32(WHITE) * _headlit(np.maximum(material.albedo, material.emission.clip(0, 1)), facing)
         shown = material.albedo / np.pi * self.light.walls[number].lookup(u, v, self.share) + material.emission
         return (shown * self.light.exposure).astype(np.float32)

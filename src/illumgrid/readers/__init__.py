@@ -74,6 +74,8 @@ def read_volume(path: str | os.PathLike[str]) -> Volume:
     IllumgridWarning
         If DICOM slices are missing, damaged or unevenly spaced.
     """
+    if not os.fspath(path):
+        raise BadInput(f"the name of the volume is empty; {EXPECTED}")  # and not the folder one is in
     file = Path(os.path.abspath(path))
     try:
         return _read(file)
