@@ -197,9 +197,9 @@ def bake(
     """
     clock = [time.perf_counter()]
     batches = [batch for batch in sampler.queries(scene, specs, seed) if len(batch)]
-    walls = wall_queries(scene, levels)
-    more = texel_paths(sum(map(len, batches)), sum(map(len, walls)))
-    batches += walls
+    texels = wall_queries(scene, levels)
+    more = texel_paths(sum(map(len, batches)), sum(map(len, texels)))
+    batches += texels
     clock.append(time.perf_counter())
 
     total, walked = sum(len(batch) for batch in batches), 0
@@ -216,7 +216,7 @@ def bake(
     clock.append(time.perf_counter())
 
     grids = []
-    del batches, walls
+    del batches, texels
     for number, spec in enumerate(specs):
         samples = _of_field(scene, answers, number)
         answers = [a for a in answers if (a.queries.target != number).any()]  # a large run is held once, not twice
