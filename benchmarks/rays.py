@@ -28,7 +28,7 @@ from scipy.ndimage import gaussian_filter
 
 from illumgrid import Queries, Scene, Volume, isosurface
 from illumgrid.backends import bvh
-from illumgrid.backends.kernels import nearest_hit
+from illumgrid.backends.kernels import NOWHERE, nearest_hit
 from illumgrid.levelset import in_frame, marchable
 
 RAYS, ROUNDS = 200_000, 9
@@ -104,7 +104,7 @@ def march_rays(fields, level, origin, direction, on, t):
     """Distances through the field, without normals: nor do the others give any."""
     for i in range(len(origin)):
         x, d = (origin[i, 0], origin[i, 1], origin[i, 2]), (direction[i, 0], direction[i, 1], direction[i, 2])
-        t[i] = nearest_hit(fields, level, x, d, on, False)[0]
+        t[i] = nearest_hit(fields, level, x, (0.0, 0.0, 0.0), d, on, NOWHERE)[0]
 
 
 def contenders(fields, tree, embree, level, on, origin, direction):
