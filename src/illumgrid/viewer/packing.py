@@ -167,7 +167,6 @@ def _field(light: "Illumination", number: int, stage: Stage, into: Bytes, notes:
     if clamped:
         notes.append(f"Values of {field.name} far outside the swept range were clamped for this page.")
     shown = light.exposure / np.pi
-    known = (grid.support > 0) & np.isfinite(grid.error)
     texture = np.diag([*(1 / np.array(grid.spec.shape)), 1.0])
     texture[:3, 3] = 0.5 / np.array(grid.spec.shape)
     albedo = field.material.albedo
@@ -179,7 +178,7 @@ def _field(light: "Illumination", number: int, stage: Stage, into: Bytes, notes:
         "swatch": _css(WHITE * albedo / albedo.max(initial=1e-9)),
         "histogram": _histogram(field),
         "values": _pack_values(steps, into) | {"base": base, "step": step},
-        "light": _pack_light(grid.values * shown, np.where(known, grid.error * shown, _HOLE), into),
+        "light": _pack_light(grid.values * shown, np.where(np.isfinite(grid.bar), grid.bar * shown, _HOLE), into),
         "toIndex": stage.to_index(volume).T.ravel().tolist(),
         "toTexture": (texture @ stage.to_index(grid.spec)).T.ravel().tolist(),
     }
@@ -240,8 +239,8 @@ def _doubt(light: "Illumination") -> float:
     """The relative error that gets the last colour: what 95 % of the nodes stay below, rounded up."""
     relative = []
     for grid in light.grids:
-        known = (grid.support > 0) & np.isfinite(grid.error) & (grid.values.mean(axis=3) > 0)
-        relative.append(grid.error[known] / grid.values[known].mean(axis=1))
+        known = np.isfinite(grid.bar) & (grid.values.mean(axis=3) > 0)
+        relative.append(grid.bar[known] / grid.values[known].mean(axis=1))
     joined = np.concatenate(relative)
     worst = float(np.quantile(joined, 0.95)) if len(joined) else 0.0
     return float(np.clip(np.ceil(worst * 50) / 50, 0.02, 1.0))
