@@ -121,7 +121,7 @@ def ways(asked):
         cases["stroke_T1, smoothed"] = Scene.sky(smooth(read_volume(place), 1.0), range=(60, 110))
     found = {}
     for name, scene in cases.items():
-        race = race_of(scene, 60 if asked.quick else 200)
+        race = race_of(scene, 60 if asked.quick else 120)
         exact = race.truths["levelset"]
         lanes = {}
         for p in race.points:

@@ -157,8 +157,8 @@ def test_the_chart_can_be_drawn_of_one_point_and_of_many(truth):
     assert chart.image(figure, "png").startswith(b"\x89PNG") and b"<svg" in chart.image(figure, "svg")
 
 
-def test_grids_of_a_quarter_to_twice_the_voxels():
-    assert sizes_of(sky(ball(20))) == [5, 10, 20, 40]
+def test_grids_of_a_third_to_twice_the_voxels_but_none_on_them():
+    assert sizes_of(sky(ball(20))) == [6, 12, 24, 38]
 
 
 def test_a_budget_or_a_scene_that_cannot_be_is_refused():
