@@ -33,6 +33,8 @@ class Way:
     interpolators : tuple of Interpolator
     denser : Way, optional
         The same with more level sets, which is tried after this one.
+    slow : float
+        What the backend takes, over what the fastest one takes.
     """
 
     sampler: Sampler
@@ -40,6 +42,7 @@ class Way:
     surface: str
     interpolators: tuple[Interpolator, ...]
     denser: "Way | None" = None
+    slow: float = 1.0
 
     def label(self, interpolator: Interpolator) -> str:
         """Name of a contestant, as the chart shows it."""
@@ -70,8 +73,8 @@ def _surfaces(backend: Any) -> Iterator[tuple[Any, str]]:
         yield backend, "levelset"
 
 
-def backends(scene: Scene, asked: Queries, budget: float) -> tuple[list[tuple[Any, str]], list[str]]:
-    """Backends with their surfaces, compiled and warm, and sentences about those that are too slow for the budget.
+def backends(scene: Scene, asked: Queries, budget: float) -> tuple[list[tuple[Any, str, float]], list[str]]:
+    """Backends with their surfaces and slowness, warm, and sentences about those that are too slow for the budget.
 
     The fastest one is never too slow.
     """
@@ -89,10 +92,10 @@ def backends(scene: Scene, asked: Queries, budget: float) -> tuple[list[tuple[An
                 notes.append(f"{backend.name} takes no part: {reason}")
                 continue
             took.append(((time.perf_counter() - begun) * 64 / len(few), backend, surface))
-    found = []
+    found, fastest = [], min((spent for spent, _, _ in took), default=1.0)
     for spent, backend, surface in took:
-        if spent <= max(SLOWEST * budget, min(took, key=lambda t: t[0])[0]):
-            found.append((backend, surface))
+        if spent <= max(SLOWEST * budget, fastest):
+            found.append((backend, surface, spent / fastest))
         else:
             notes.append(f"{backend.name} takes no part: 64 queries with 4 paths took {spent:.2f} s")
     return found, notes
@@ -104,13 +107,13 @@ def ways(scene: Scene, asked: Queries, budget: float) -> tuple[list[Way], list[s
     interpolators = tuple(_stages("interpolator"))
     found = []
     for sampler in _stages("sampler"):
-        for backend, surface in tracers:
+        for backend, surface, slow in tracers:
             if not hasattr(sampler, "count"):
-                found.append(Way(sampler, backend, surface, interpolators))
+                found.append(Way(sampler, backend, surface, interpolators, slow=slow))
                 continue
             way = None
             for count in COUNTS[::-1]:
-                way = Way(replace(sampler, count=count), backend, surface, interpolators, way)
+                way = Way(replace(sampler, count=count), backend, surface, interpolators, way, slow)
             if way is not None:
                 found.append(way)
     return found, notes

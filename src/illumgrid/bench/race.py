@@ -165,7 +165,11 @@ class Race:
         self, scene: Scene, truths: dict[str, Truth], ways: list[Way], sizes: list[int], bounces: int, seed: int
     ) -> None:
         self.scene, self.truths, self.sizes, self.bounces, self.seed = scene, truths, sizes, bounces, seed
-        self.lanes = [Lane(Run(scene, way, sizes[0], bounces, seed), way.interpolators) for way in ways]
+        # Until it has run, a slow backend counts as off the front by its slowness.
+        self.lanes = [
+            Lane(Run(scene, way, sizes[0], bounces, seed), way.interpolators, lag=way.slow**0.5)
+            for way in sorted(ways, key=lambda way: way.slow)
+        ]
         self.points: list[Point] = []
         self.notes: list[str] = []
 
@@ -181,6 +185,9 @@ class Race:
             self.lanes.remove(lane)
             return
         spent = time.perf_counter() - begun
+        for other in self.lanes:
+            if other.cost == 0.0:  # nobody has run before this one
+                other.cost = spent * other.run.way.slow / run.way.slow
         truth = self.truths[run.way.surface]
         before = [p for p in self.points if p.way is run.way and p.grid == run.grid and p.paths == PATHS[lane.rung - 1]]
         self.points += new
