@@ -238,7 +238,7 @@ class Race:
         """
         kept = 1.1 * (SEEDS - 1) * sum(self.front_ladders().values())
         able = [lane for lane in self.lanes if not lane.stuck and lane.rung < len(PATHS)]
-        able = [lane for lane in able if kept + (2 * SEEDS - 1) * lane.cost < left or lane.cost == 0.0]
+        able = [lane for lane in able if kept + SEEDS * lane.cost < left or lane.cost == 0.0]
         return min(able, key=lambda lane: (lane.cost * lane.lag**2, lane.run.grid), default=None)
 
     def front_ladders(self) -> dict[tuple[int, int, int], float]:
