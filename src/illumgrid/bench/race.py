@@ -167,7 +167,7 @@ class Race:
         self.scene, self.truths, self.sizes, self.bounces, self.seed = scene, truths, sizes, bounces, seed
         # Until it has run, a slow backend counts as off the front by its slowness.
         self.lanes = [
-            Lane(Run(scene, way, sizes[0], bounces, seed), way.interpolators, lag=way.slow**0.5)
+            Lane(Run(scene, way, sizes[0], bounces, seed), way.interpolators, lag=way.slow)
             for way in sorted(ways, key=lambda way: way.slow)
         ]
         self.points: list[Point] = []
@@ -176,7 +176,7 @@ class Race:
     def step(self, lane: Lane) -> None:
         """Take the next rung of a lane, and fill the grid by every interpolator."""
         run, paths = lane.run, PATHS[lane.rung]
-        begun = time.perf_counter()
+        begun, before_it = time.perf_counter(), lane.run.tracing + lane.run.asking
         try:
             run.go_on(paths)
             new = [self._point(run, interpolator)[0] for interpolator in lane.interpolators]
@@ -192,17 +192,17 @@ class Race:
         before = [p for p in self.points if p.way is run.way and p.grid == run.grid and p.paths == PATHS[lane.rung - 1]]
         self.points += new
         now = [p.rmse(truth) for p in new]
-        # A way off the front by a factor waits by its square: what noise would take to make that up.
-        lead = {id(p): self._lead(p) for p in new}
-        lags = [max(1.0, r / lead[id(p)]) for r, p in zip(now, new)]
+        lags = [self._lag(p) for p in new]
         lane.lag = min(lags)
         if len(new) > 1:  # a slow filler that is also far off holds the others up
             slow = [p.seconds[0] - run.asking - run.tracing > 0.5 * (run.asking + run.tracing) for p in new]
-            keep = [not (s and lag > max(2.0, 1.5 * lane.lag)) for s, lag in zip(slow, lags)]
+            keep = [not (s and lag > max(4.0, 2.0 * lane.lag)) for s, lag in zip(slow, lags)]
             lane.interpolators = tuple(p.interpolator for p, k in zip(new, keep) if k)
         lane.stuck = bool(before) and min(now) > 0.9 * min(p.rmse(truth) for p in before)
         lane.rung += 1
-        lane.cost = spent * (PATHS[lane.rung] / paths - 1) if lane.rung < len(PATHS) else np.inf
+        if lane.rung < len(PATHS):
+            filling = spent - (run.tracing + run.asking - before_it)
+            lane.cost = run.tracing * (PATHS[lane.rung] / paths - 1) + filling
         if lane.rung == 1:
             self._unlock(lane, spent)
 
@@ -226,10 +226,16 @@ class Race:
         point.light.append(look_up(grids, asked))
         return point, grids
 
-    def _lead(self, point: Point) -> float:
-        """Least error of anybody who took no longer."""
-        truth = self.truths
-        return max(1e-9, min(p.rmse(truth[p.way.surface]) for p in self.points if p.time <= 1.05 * point.time))
+    def _lag(self, point: Point) -> float:
+        """How much less time would do: that of the quickest as good, or what noise takes to become as good as the best.
+
+        Noise halves with four times the paths, hence the square of the error over the least of any no slower.
+        """
+        error = {id(p): max(1e-9, p.rmse(self.truths[p.way.surface])) for p in self.points}
+        own = error[id(point)]
+        lead = min(error[id(p)] for p in self.points if p.time <= 1.05 * point.time)
+        quick = min(p.time for p in self.points if error[id(p)] <= 1.05 * own)
+        return float(max(1.0, (own / lead) ** 2, point.time / quick))
 
     def next(self, left: float) -> Lane | None:
         """The lane to step: least predicted time, those who lag counted as slower; None if the rest is too costly.
@@ -239,7 +245,7 @@ class Race:
         kept = 1.1 * (SEEDS - 1) * sum(self.front_ladders().values())
         able = [lane for lane in self.lanes if not lane.stuck and lane.rung < len(PATHS)]
         able = [lane for lane in able if kept + SEEDS * lane.cost < left or lane.cost == 0.0]
-        return min(able, key=lambda lane: (lane.cost * lane.lag**2, lane.run.grid), default=None)
+        return min(able, key=lambda lane: (lane.cost * lane.lag, lane.run.grid), default=None)
 
     def front_ladders(self) -> dict[tuple[int, int, int], float]:
         """Way, grid and most paths of the front's points that lack seeds, with the seconds of the longest of each."""
