@@ -176,7 +176,7 @@ class Race:
     def step(self, lane: Lane) -> None:
         """Take the next rung of a lane, and fill the grid by every interpolator."""
         run, paths = lane.run, PATHS[lane.rung]
-        begun, before_it = time.perf_counter(), lane.run.tracing + lane.run.asking
+        begun = time.perf_counter()
         try:
             run.go_on(paths)
             new = [self._point(run, interpolator)[0] for interpolator in lane.interpolators]
@@ -194,15 +194,16 @@ class Race:
         now = [p.rmse(truth) for p in new]
         lags = [self._lag(p) for p in new]
         lane.lag = min(lags)
-        if len(new) > 1:  # a slow filler that is also far off holds the others up
-            slow = [p.seconds[0] - run.asking - run.tracing > 0.5 * (run.asking + run.tracing) for p in new]
-            keep = [not (s and lag > max(4.0, 2.0 * lane.lag)) for s, lag in zip(slow, lags)]
-            lane.interpolators = tuple(p.interpolator for p, k in zip(new, keep) if k)
+        light = run.asking + run.tracing
+        fillers = {p.interpolator: p.seconds[0] - light for p in new}
+        for p, lag in zip(new, lags):  # a slow filler that is also far off holds the others up
+            if fillers[p.interpolator] > 0.5 * light and lag > max(4.0, 2.0 * lane.lag):
+                del fillers[p.interpolator]
+        lane.interpolators = tuple(fillers)
         lane.stuck = bool(before) and min(now) > 0.9 * min(p.rmse(truth) for p in before)
         lane.rung += 1
         if lane.rung < len(PATHS):
-            filling = spent - (run.tracing + run.asking - before_it)
-            lane.cost = run.tracing * (PATHS[lane.rung] / paths - 1) + filling
+            lane.cost = run.tracing * (PATHS[lane.rung] / paths - 1) + sum(fillers.values())
         if lane.rung == 1:
             self._unlock(lane, spent)
 
@@ -211,11 +212,12 @@ class Race:
         run = lane.run
         if finer := [size for size in self.sizes if size > run.grid]:
             ahead = Run(self.scene, run.way, finer[0], self.bounces, self.seed)
-            self.lanes.append(Lane(ahead, lane.interpolators, 0, spent * (finer[0] / run.grid) ** 3, lane.lag))
+            # Twice the nodes may halve the error, for which noise would need four times the paths: so much sooner.
+            more = finer[0] / run.grid
+            self.lanes.append(Lane(ahead, lane.interpolators, 0, spent * more**3, lane.lag / more**2))
         if run.way.denser and run.grid == self.sizes[0]:
             ahead = Run(self.scene, run.way.denser, run.grid, self.bounces, self.seed)
-            more = COUNTS[1] / COUNTS[0]
-            self.lanes.append(Lane(ahead, lane.interpolators, 0, spent * more, lane.lag))
+            self.lanes.append(Lane(ahead, lane.interpolators, 0, spent * COUNTS[1] / COUNTS[0], lane.lag))
 
     def _point(self, run: Run, interpolator: Interpolator) -> tuple[Point, list[IlluminationGrid]]:
         grids, seconds = run.fill(interpolator)
