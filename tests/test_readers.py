@@ -189,7 +189,7 @@ def table():
 
 
 @real
-@pytest.mark.parametrize("row", table(), ids=lambda row: row[0])
+@pytest.mark.parametrize("row", table(), ids=[row[0] for row in table()])
 def test_real_volume(row):
     name, shape, _, spacing, span = row
     volume = read_volume(VOLUMES / name)
