@@ -203,7 +203,7 @@ def volumes(asked):
         if not (asked.volumes / name).exists():
             continue
         scene = Scene.sky(read_volume(asked.volumes / name), range=limits)
-        result = bench(scene, 40 if asked.quick else 100)
+        result = bench(scene, 40 if asked.quick else 60)
         content, said = report.files(result, name.split(".")[0], scene)
         (asked.json.parent / f"chart-{name.split('.')[0]}.png").write_bytes(content["chart.png"])
         light, took = timed(scene)
