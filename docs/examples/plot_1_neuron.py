@@ -36,9 +36,10 @@ light = ig.run(scene, grid=128, paths=32, bounces=2, isovalues=4)
 # nearer. On the right each throws a shadow: the farther the shadow lies from its branch and the softer it is, the
 # higher the branch; where both meet, it touches the floor. Branches in a bundle dim each other.
 
+level = limits[0] + (limits[1] - limits[0]) / 6
 figure, axes = plt.subplots(1, 2, figsize=(10, 4.6), facecolor="0.235", layout="constrained")
 for ax, local in zip(axes, (True, False)):
-    ax.imshow(render(light, isovalue=limits[0] + 5, width=600, height=560, local=local, view=(-35, 50)))
+    ax.imshow(render(light, isovalue=level, width=600, height=560, local=local, view=(-35, 50)))
     ax.set_title("local light" if local else "global light", color="white")
     ax.set_axis_off()
 plt.show()
