@@ -11,6 +11,9 @@ pays
 volumes
     `bench` on real volumes (charts as PNG beside the JSON file), and where `run`'s defaults lie against the front.
 
+defaults
+    The default nodes and paths of `run` beside others, `direct` and `nearest`, on real volumes.
+
 All with a white sky, albedo 0.8, 6 bounces unless chosen by the pilot, and the backend numba. Real volumes are looked
 for in DIR, by default ../shared/volumes from the repository's root, and passed over where they are not.
 """
@@ -218,7 +221,28 @@ def volumes(asked):
     return found
 
 
-PARTS = {part.__name__: part for part in (promises, ways, goals, pays, volumes)}
+def defaults(asked):
+    """The default of `run` beside other nodes and paths, on real volumes: `direct`, `nearest`, the same truth."""
+    tried = ((0.6, 128), (0.85, 64), (1.0, 64), (1.2, 16), (1.2, 32), (1.2, 64), (1.41, 16), (1.9, 8))
+    found = {}
+    for name, limits in RANGES.items():
+        if not (asked.volumes / name).exists():
+            continue
+        scene = Scene.sky(read_volume(asked.volumes / name), range=limits)
+        longest = min(125, max(scene.fields[0].volume.shape))  # so that 1.2 of it is the default
+        truth = truth_of(scene, 0.01, levels=24, points=6000, paths=512)
+        found[name] = []
+        for density, paths in tried:
+            light, took = timed(scene, grid=round(density * longest), paths=paths, isovalues=4)
+            found[name].append((density, paths, took, off(light, truth).rmse))
+        took = {(d, p): (t, e) for d, p, t, e in found[name]}
+        own = took[1.2, 32]
+        said = "; ".join(f"{d:g} x {p}: {t / own[0]:.2f}, {e:.2%}" for (d, p), (t, e) in took.items())
+        print(f"  {name:20} default {own[0]:.2f} s; nodes x paths: times it, error: {said}", flush=True)
+    return found
+
+
+PARTS = {part.__name__: part for part in (promises, ways, goals, pays, volumes, defaults)}
 
 
 def main():
