@@ -23,8 +23,8 @@ from illumgrid.volume import Volume
 PATHS, DENSITY, LONGEST = 32, 1.2, 150
 """When nothing else is asked for: paths from every query, nodes for each voxel's side, nodes along an axis at most.
 
-At equal cost fewer paths from more nodes are closer to the truth than 64 from one node a voxel, on all real volumes
-tried; and nodes that lie on the voxels are the worst place to ask, since there the data repeat their values.
+At about equal cost closer to the truth than 64 paths from one node a voxel on three of four real volumes (not on the
+smoothest), by twice on one: ``benchmarks/chart.py defaults``. Nodes on the voxels are the worst place for noisy data.
 """
 
 

@@ -54,7 +54,7 @@ class Report:
 def sizes(scene: Scene) -> list[int]:
     """Grids that take part: 0.3, 0.6, 1.2 and 1.9 nodes for each voxel along the longest axis.
 
-    Not 1 or 2: nodes on voxels are the worst place to ask on noisy data.
+    Not 1 or 2: nodes on voxels are the worst place to ask on noisy data (docs/stability.md).
     """
     longest = max(max(field.volume.shape) for field in scene.fields)
     return sorted({max(4, round(longest * share)) for share in (0.3, 0.6, 1.2, 1.9)})
