@@ -14,7 +14,7 @@ import illumgrid as ig
 from illumgrid.preview import render
 
 volume, limits, source = brain()
-light = ig.run(ig.Scene.sky(volume, albedo=(0.8, 0.66, 0.6), range=limits), grid=max(volume.shape), paths=24)
+light = ig.run(ig.Scene.sky(volume, albedo=(0.8, 0.66, 0.6), range=limits), paths=24)
 
 # %%
 # **What to look for:** the cleft between the halves, and the one above the temple, are the deepest. On the left they

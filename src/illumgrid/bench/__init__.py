@@ -21,6 +21,8 @@ from illumgrid.truth import Truth, begin, converge, enough, unseen_on_level_sets
 TRUTH, PARTS, PICTURE = 0.25, 0.12, 0.05
 """Shares of the budget for the truth, the parts of the error and the converged picture."""
 
+LONGEST = 1e7  # seconds of a budget: four months; counts of paths in proportion to it stay whole numbers
+
 
 @dataclass(frozen=True, eq=False)
 class Report:
@@ -58,9 +60,6 @@ def sizes(scene: Scene) -> list[int]:
     """
     longest = max(max(field.volume.shape) for field in scene.fields)
     return sorted({max(4, round(longest * share)) for share in (0.3, 0.6, 1.2, 1.9)})
-
-
-LONGEST = 1e7  # seconds of a budget: four months; counts of paths in proportion to it stay whole numbers
 
 
 def _unseen(scene: Scene, budget: float, seed: int) -> Queries:
