@@ -108,7 +108,7 @@ def main():
         told = "  ".join(f"{n}: {e:.3%}" for n, e in zip(COUNTS, curves[name]))
         print(f"{name}: paths^{slope(curves[name]):.2f}   {told}", flush=True)
         truths = [light(scene, asked(scene, WIDE[1]), WIDE[0], 1000 + k) for k in (0, 1)]
-        for paths in (16, 64, 256):
+        for paths in (16, 32, 64, 256):
             covered, ratio = bars(scene, paths, truths)
             lines.append(f"| {name} | {paths} | {covered:.1%} | {ratio:.2f} |")
             print(lines[-1], flush=True)

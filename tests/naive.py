@@ -11,7 +11,7 @@ from itertools import pairwise, product
 
 import numpy as np
 
-from illumgrid.rng import draw, draw_pair, net_size, partner, stream
+from illumgrid.rng import draw, draw_pair, net_size, sharing, stream
 
 WALL = 1e-10
 """A wall reaches this share of its size farther than its corners say."""
@@ -459,22 +459,51 @@ def solve(scene, queries, paths, bounces, seed):
             continue
         light = np.array([math.pi * path_worth(scene, query, path, bounces, seed) for path in paths])
         mean[i], count[i] = light.mean(axis=0), len(paths)
-        m2[i] = spread(light, paths)
+        m2[i] = [spread(list(light[:, c]), paths.start, math.pi * scene.background[c]) for c in range(3)]
     return mean, m2, count
 
 
-def spread(light, paths):
-    """The m2 (3,) of the light (n, 3) of paths, from couples that share a box of their net.
+def box_of_four(size, a):
+    """Masks from a path of a net to the two that share a half of its box of 4 / size, 2^-a by 2^-b, with it."""
+    b = size.bit_length() - 3 - a
+    return sharing(a + 1, b), sharing(a, b + 1)
 
-    Cut the paths into nets, the largest first from the front; path i of a net of that size has the mate
-    i ^ partner(size). Paths that are nets by themselves are two at most: one more couple.
-    """
-    couples, alone, at = [], [], paths.start
-    while at < paths.stop:
-        size = net_size(at, paths.stop - at)
-        couples += [(at + i, at + (i ^ partner(size))) for i in range(size) if i < i ^ partner(size)]
-        alone += [at] if size == 1 else []
-        at += size
-    couples += [tuple(alone)] if len(alone) == 2 else []
-    total = sum((((light[i - paths.start] - light[j - paths.start]) ** 2) for i, j in couples), np.zeros(3))
-    return total * (len(paths) - 1) / max(2 * len(couples), 1)
+
+def mixed_differences(worth, many):
+    """Variance of a path, from the four paths of each box of the squarest shapes."""
+    last, found = len(worth).bit_length() - 3, []
+    for a in sorted(range(last + 1), key=lambda a: abs(2 * a - last - 0.5))[:many]:
+        first, second = box_of_four(len(worth), a)
+        seen = set()
+        for i in range(len(worth)):
+            box = i, i ^ first, i ^ second, i ^ first ^ second
+            if i not in seen:
+                found.append((worth[box[0]] - worth[box[1]] - worth[box[2]] + worth[box[3]]) ** 2 / 4)
+                seen.update(box)
+    return math.fsum(found) / len(found)
+
+
+def net_variance(worth):
+    """Variance of a path, as the next finer net will have it."""
+    if len(worth) == 2:
+        return (worth[0] - worth[1]) ** 2 / 2
+    many = 2 if len(worth) in (128, 512, 2048, 8192) else 3
+    fine, quarter = mixed_differences(worth, many), len(worth) // 4
+    if quarter < 4:
+        return fine
+    coarse = sum(mixed_differences(worth[k * quarter : (k + 1) * quarter], many) for k in range(4)) / 4
+    if fine >= coarse:
+        return fine
+    return fine * max(0.5, fine / coarse)
+
+
+def spread(worth, first, sky):
+    """The m2 of the light of paths number `first` on (a list), under a sky of that irradiance."""
+    count, nets = len(worth), []
+    while sum(map(len, nets)) < count:
+        at = sum(map(len, nets))
+        nets.append(worth[at : at + net_size(first + at, count - at)])
+    told = [net for net in nets if len(net) > 1] or ([worth] if count == 2 else [])
+    per_path = sum(len(net) * net_variance(net) for net in told) / max(1, sum(map(len, told)))
+    unseen = 0.2 * max(sum(worth) / count, sky) / count
+    return count * (count - 1) * (per_path / count + unseen**2)

@@ -293,7 +293,7 @@ def test_small_furnaces_planes_and_cavities():
     scene = Scene.sky(linear((2, 3, -5), (4, 4, 4)), range=(-9, 10))
     answer = SOLO.solve(scene, on_sets(scene, 2, 10), paths=range(3), bounces=1, seed=0)
     np.testing.assert_allclose(answer.mean, math.pi, rtol=1e-6)
-    np.testing.assert_allclose(answer.m2, 0, atol=1e-10)
+    np.testing.assert_allclose(answer.stderr, 0.2 * math.pi / 3, rtol=1e-5)  # what so few may have missed
 
     shut = np.pad(noise(4, (6, 3, 3)).values, 1, constant_values=9)
     scene = Scene.sky(Volume(shut), (1, 1, 1), (-0.5, 3.5))

@@ -9,7 +9,6 @@ from scipy.stats import qmc
 
 from illumgrid import rng
 from illumgrid.backends import kernels  # compiles the functions of rng for Numba  # noqa: F401
-from illumgrid.backends.reference import couples
 
 U = np.uint64
 
@@ -86,44 +85,13 @@ def test_queries_seeds_and_pairs_are_uncorrelated():
             assert abs(each.mean() / (each.std() / math.sqrt(queries))) < 4.9, (i, j)
 
 
-def test_partners_share_a_box():
-    for m in range(1, 14):
-        n, b = 2**m, m // 2
-        a, mate, i = m - 1 - b, rng.partner(n), np.arange(n // 2)
-        assert n // 2 <= mate < n
+def test_paths_share_the_bits_that_are_asked_for():
+    for along, across in ((0, 0), (1, 0), (0, 1), (3, 2), (2, 3), (4, 4), (7, 5)):
+        mask, n = rng.sharing(along, across), 2 ** (along + across + 1)
+        assert n // 2 <= mask < n
         for start in (0, 3 * n):
-            u, v = points(3, m, start + i, 0)
-            u2, v2 = points(3, m, start + (i ^ mate), 0)
-            assert (np.floor(u * 2**a) == np.floor(u2 * 2**a)).all()
-            assert (np.floor(v * 2**b) == np.floor(v2 * 2**b)).all()
-    assert rng.partner(1) == 0
-
-
-def test_couples_use_every_path_once():
-    for paths in (range(64), range(3, 40), range(1, 3), range(7, 8), range(0), range(5, 6), range(65)):
-        used = [path for couple in couples(paths) for path in couple if path is not None]
-        assert sorted(used) == list(paths)
-        assert sum(other is None for _, other in couples(paths)) <= 1
-
-
-def spread(worth, paths):
-    pairs = [couple for couple in couples(paths) if couple[1] is not None]
-    one, other = (worth[:, np.array(index) - paths.start] for index in zip(*pairs))
-    return ((one - other) ** 2).sum(axis=1) * (len(paths) - 1) / (2 * len(pairs))
-
-
-def test_the_spread_of_independent_worths_is_unbiased():
-    random = np.random.default_rng(1).normal(size=(20000, 37))
-    for paths in (range(2), range(1, 3), range(3), range(3, 40), range(36), range(5, 13)):
-        m2 = spread(random[:, : len(paths)], paths)
-        assert abs(m2.mean() / (len(paths) - 1) - 1) < 6 * m2.std() / (len(paths) - 1) / math.sqrt(len(m2))
-
-
-def test_points_beat_chance_and_their_bars_are_on_the_safe_side():
-    key = rng.stream(U(0), np.arange(3000, dtype=U))[:, None]
-    for paths, gain in ((range(16), 3), (range(64), 7), (range(64, 128), 7), (range(17, 117), 3), (range(1024), 25)):
-        u, v = rng.draw_pair(key, np.array(paths, dtype=U)[None], U(0))
-        worth, n, truth = 1.0 * (u + 0.7 * v < 0.8), len(paths), 0.8 - 0.35
-        error = ((worth.mean(axis=1) - truth) ** 2).mean()
-        assert truth * (1 - truth) / n > gain * error
-        assert 0.95 < math.sqrt(spread(worth, paths).mean() / (n * (n - 1)) / error) < 2.0
+            i = np.arange(n)
+            (u, v), (u2, v2) = points(3, 5, start + i, 0), points(3, 5, start + (i ^ mask), 0)
+            for one, other, bits in ((u, u2, along), (v, v2, across)):
+                assert (np.floor(one * 2**bits) == np.floor(other * 2**bits)).all()
+                assert (np.floor(one * 2 ** (bits + 1)) != np.floor(other * 2 ** (bits + 1))).all()

@@ -236,9 +236,7 @@ def run(
         bounces, left_out = enough_bounces(scene, chosen[1], seed)
     else:
         left_out = light_left_out(scene, chosen[1], bounces, seed)
-    baked = bake(
-        scene, specs, levels, *chosen, paths=walked, bounces=bounces, seed=seed, map=map, progress=progress
-    )
+    baked = bake(scene, specs, levels, *chosen, paths=walked, bounces=bounces, seed=seed, map=map, progress=progress)
     for field, holes in zip(scene.fields, baked.holes):
         if holes:
             tell(

@@ -83,7 +83,7 @@ def upward(x, seed):  # type: ignore[no-untyped-def]
 def draw_pair(key, path, pair):  # type: ignore[no-untyped-def]
     """Two uniform numbers in [0, 1) for a query's key, a path and the number of a pair: all uint64, `pair` a scalar.
 
-    Pair 0 takes the points in their order, so that `partner` holds; the others in an order of their own.
+    Pair 0 takes the points in their order, so that `sharing` holds; the others in an order of their own.
     """
     seed = mix(key ^ mix(pair + _GOLDEN))
     index = path
@@ -102,20 +102,15 @@ def net_size(first, count):  # type: ignore[no-untyped-def]
     return size
 
 
-def partner(size):  # type: ignore[no-untyped-def]
-    """Mask d for a net of `size` = 2^m paths: path i and path i ^ d lie in one box of volume 2 / size of pair 0.
+def sharing(along, across):  # type: ignore[no-untyped-def]
+    """Mask d for which paths i and i ^ d share `along` bits of pair 0's first number and `across` of its second.
 
-    The box is 2^-a by 2^-b with b = m // 2 (of the second number) and a = m - 1 - b. Read as polynomials over GF(2),
-    the two indices differ by d(x): they share a bits of the first number if x^a divides d, and b bits of the second,
-    where `pascal` turns d(x) into d(x + 1), if (x + 1)^b does. So d = x^a (x + 1)^b, of degree m - 1: its top bit is
-    size / 2, and the paths below that bit are one of each couple. Scrambling keeps boxes. Of a single path, 0.
+    Read as polynomials over GF(2), the two indices differ by d(x): they share a bits of the first number if x^a divides
+    d, and b bits of the second, where `pascal` turns d(x) into d(x + 1), if (x + 1)^b does. So d = x^a (x + 1)^b, of
+    degree a + b: in a net of 2^(a + b + 1) paths it leads to the only other path in a box of 2^-a by 2^-b. Scrambling
+    keeps boxes.
     """
-    if size < 2:
-        return 0
-    a, mask, bits = -1, 1, size
-    while bits > 1:  # each second halving of the net adds a factor x + 1, the others a factor x
-        bits //= 2
-        a += 1
-    for _ in range((a + 1) // 2):
+    mask = 1
+    for _ in range(across):
         mask ^= mask << 1
-    return mask << (a - (a + 1) // 2)
+    return mask << along

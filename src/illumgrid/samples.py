@@ -101,8 +101,8 @@ class Samples:
         Irradiance, linear RGB, never clamped: π times the mean worth of a cosine-distributed path.
     m2 : (n, 3) float32
         Spread of the mean, as paths (paths - 1) stderr²: for independent paths the sum of squared deviations; here from
-        couples of paths that share a box of their net, so that it measures noise and not the change of light over the
-        hemisphere.
+        the differences of paths that share a box of their net, so that it measures noise and not the change of light
+        over the hemisphere, and from what so few paths may have missed.
     paths : (n,) int32
         Number of paths; 0 marks a hole, whose mean and m2 are 0.
     """
@@ -143,6 +143,16 @@ def check_request(paths: range, bounces: int) -> None:
         raise BadInput(f"paths is {paths!r}; expected a range of path numbers from 0 up with step 1, such as range(64)")
     if bounces < 0:
         raise BadInput(f"{bounces} bounces were asked for; expected 0 (light straight from the sky) or more")
+
+
+LONGEST = 1 << 16
+"""Paths that a backend of this package follows in one go: it keeps what each is worth."""
+
+
+def halves(paths: range) -> tuple[range, range]:
+    """The range in two, the first a power of two and at least as long."""
+    cut = 1 << (len(paths) - 1).bit_length() - 1
+    return paths[:cut], paths[cut:]
 
 
 def combine(one: Samples, other: Samples) -> Samples:

@@ -102,33 +102,45 @@ def sidak(tests: int, level: float) -> float:
     return NormalDist().inv_cdf(0.5 * (1 + (1 - level) ** (1 / tests)))
 
 
-def _score(off: Floats, bar: Floats, bound: Floats) -> tuple[Floats, Floats]:
+def _score(off: Floats, bar: Floats, bound: Floats, noise: float) -> tuple[Floats, Floats]:
     """Score z of the mean over queries (3,), and of each query (n, 3), from differences and standard errors (n, 3)."""
     with np.errstate(divide="ignore", invalid="ignore"):
         # The bound is a bias: over many queries it does not average out.
-        whole = off.mean(axis=0) / np.hypot(np.sqrt((bar**2).sum(axis=0)) / len(off), bound.mean())
+        whole = off.mean(axis=0) / np.hypot(noise * np.sqrt((bar**2).sum(axis=0)) / len(off), bound.mean())
         # A bar from few paths can be too short by luck: none is taken to be shorter than their root mean square.
-        least = np.sqrt((bar**2).mean(axis=0))
-        each = off / np.hypot(np.maximum(bar, least), bound[:, None])
+        longest = np.maximum(bar, np.sqrt((bar**2).mean(axis=0))) if noise else 0.0 * bar
+        each = off / np.hypot(longest, bound[:, None])
     return np.where(off.mean(axis=0) == 0, 0.0, whole), np.where(off == 0, 0.0, each)
 
 
-def _measure(case: Case, backend: Backend, paths: int, seed: int) -> tuple[Floats, Floats, Bools]:
-    """What a backend finds for `expected`, its standard error, and which queries were answered."""
+def _measure(case: Case, backend: Backend, paths: int, seed: int) -> tuple[Floats, Floats, Bools, float]:
+    """What a backend finds for `expected`, its standard error, which queries were answered, and the error's noise.
+
+    The last is the share of the standard error that is seen as noise: 0 if every path finds the same.
+    """
     # A power of two suits scrambled sequences.
     least = 4 if case.area is None else 0  # the spread of a query's own paths is asked for
     count = 1 << max(least, int(np.log2(max(1, paths / len(case.queries)))))
+    if case.area is None:
+        one, other = (
+            backend.solve(case.scene, case.queries, paths=range(count // 2), bounces=case.bounces, seed=s)
+            for s in (seed, seed + 1)
+        )
+        good = (one.paths > 0) & (other.paths > 0)
+        light, bar = 0.5 * (one.mean.astype(float) + other.mean), 0.5 * np.hypot(one.stderr, other.stderr, dtype=float)
+        # Bars allow for what few paths may have missed; how far two seeds are apart tells the noise that there is.
+        apart = 0.5 * (one.mean.astype(float) - other.mean)[good]
+        share = min(1.0, np.sqrt((apart**2).sum() / (bar[good] ** 2).sum())) if good.any() and apart.any() else 0.0
+        return light, bar, good, float(share)
     answer = backend.solve(case.scene, case.queries, paths=range(count), bounces=case.bounces, seed=seed)
     light, good = answer.mean.astype(float), answer.paths > 0
-    if case.area is None:
-        return light, answer.stderr.astype(float), good
     if case.kept is not None:
         fewer = backend.solve(case.scene, case.queries, paths=range(count), bounces=case.bounces - 1, seed=seed)
         light -= case.kept * fewer.mean
     light *= case.area[:, None]
     # Twice the variance of one point of a cell is the mean of (y1 - y2)², and it is the variance of y1 + y2.
     bar = np.sqrt(((light[::2] - light[1::2]) ** 2).sum(axis=0))
-    return light.sum(axis=0)[None], bar[None], np.ones(1, bool)
+    return light.sum(axis=0)[None], bar[None], np.ones(1, bool), 1.0
 
 
 def applies(case: Case, backend: Backend) -> bool:
@@ -141,11 +153,11 @@ def judge(
 ) -> Row:
     """Trace about `paths` paths, shared by the queries of a case; it agrees if no |z| is above its limit."""
     begun = time.perf_counter()
-    measured, bar, answered = _measure(case, backend, paths, seed)
+    measured, bar, answered, noise = _measure(case, backend, paths, seed)
     enough = answered.mean() > 1 - _HOLES
     expected, bound = (np.broadcast_to(part, (len(measured), *part.shape[1:])) for part in (case.expected, case.bound))
     measured, bar, expected, bound = (part[answered] if enough else part for part in (measured, bar, expected, bound))
-    whole, each = _score(measured - expected, bar, bound)
+    whole, each = _score(measured - expected, bar, bound, noise)
     worst = float(np.abs(each).max()) if enough else np.inf
     color = int(np.abs(whole).argmax())
     z = float(whole[color]) if enough else np.inf

@@ -21,9 +21,9 @@ from illumgrid.backends import bvh, lanes
 from illumgrid.backends.bvh import View, cast
 from illumgrid.backends.lanes import address, at_least, cached, count_below
 from illumgrid.levelset import Marchable
-from illumgrid.rng import draw, draw_pair, mix, net_size, partner, pascal, reverse, stream, upward
+from illumgrid.rng import draw, draw_pair, mix, net_size, pascal, reverse, sharing, stream, upward
 
-for _function in (mix, stream, draw, reverse, pascal, upward, draw_pair, net_size, partner):
+for _function in (mix, stream, draw, reverse, pascal, upward, draw_pair, net_size, sharing):
     register_jitable(_function)
 
 # No fastmath: a miss is t = inf, and the sign of a coefficient near zero decides the side.
@@ -39,6 +39,10 @@ REACH = (1, 1, 2, 3, 4, 6, 8, 16, 1 << 20)  # bricks to leap, by how many cubes 
 ONE = np.uint64(1)
 ON_A_VOXEL = 1e-7  # as in illumgrid.volume
 ON_A_WALL = 1e-10  # a wall reaches this share of its size farther, so that walls joined at an edge leave no gap
+# Sizes 128, 512, ... of nets whose boxes of four paths are no squares: two shapes come near one. Fewer paths than that
+# take a third shape, too, or their differences would be too few.
+NOT_SQUARE = 0x2AAAAA80
+UNSEEN = 0.2  # measured: docs/light_transport.md
 NOWHERE, LOST = -1, -2  # instead of a face: a surface that needs none; a query whose mesh is out of reach
 
 
@@ -766,44 +770,74 @@ def walk(scene, key, path, bounces, level, own, own_face, x, n):
 
 
 @jit
-def mean_worth(scene, key, first, count, bounces, level, own, face, x, n):
-    """Mean worth of paths number first .. first + count - 1 of one query, and their m2: six numbers.
+def mixed_differences(worth, at, size, channel, many):
+    """Variance of a path as four paths in one box tell it, that share a half of it by twos: in both ways.
 
-    Collapsed strata: the range is cut into nets; within a net two paths that share a box differ by noise alone, however
-    the light changes from box to box. m2 = (count - 1) Σ (one - other)² / (paths in couples), so that
-    stderr² = m2 / (count (count - 1)). Paths without a mate are two at most, first and last: they are a couple.
+    (one - two - three + four)² / 4, over all paths of the net from row `at` on and `many` of the squarest shapes of
+    box. What changes along one number alone cancels, as it does in the mean over the net.
     """
-    sum_r, sum_g, sum_b, off_r, off_g, off_b = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    at, left, coupled = first, count, 0
-    lone, lone_r, lone_g, lone_b = False, 0.0, 0.0, 0.0
-    while left > 0:
-        size = net_size(at, left)
-        mate = partner(size)
-        for i in range(max(size // 2, 1)):
-            red, green, blue = walk(scene, key, np.uint64(at + i), bounces, level, own, face, x, n)
-            sum_r, sum_g, sum_b = sum_r + red, sum_g + green, sum_b + blue
-            if size == 1 and not lone:
-                lone, lone_r, lone_g, lone_b = True, red, green, blue
-                continue
-            if size == 1:
-                other_r, other_g, other_b = lone_r, lone_g, lone_b
-            else:
-                mate_path = np.uint64(at + (i ^ mate))
-                other_r, other_g, other_b = walk(scene, key, mate_path, bounces, level, own, face, x, n)
-                sum_r, sum_g, sum_b = sum_r + other_r, sum_g + other_g, sum_b + other_b
-            off_r += (red - other_r) ** 2
-            off_g += (green - other_g) ** 2
-            off_b += (blue - other_b) ** 2
-            coupled += 2
-        at += size
-        left -= size
-    share = (count - 1) / max(coupled, 1)
-    return sum_r / count, sum_g / count, sum_b / count, off_r * share, off_g * share, off_b * share
+    last = 0  # shapes: boxes of 2^-a by 2^-b with a + b = last
+    while 8 << last <= size:
+        last += 1
+    total, shapes, squarest = 0.0, 0, (last + 1) // 2
+    for a in range(max(0, squarest - 1), min(last, squarest - 2 + many) + 1):
+        first, second = sharing(a + 1, last - a), sharing(a, last - a + 1)
+        for i in range(at, at + size // 4):
+            j = i - at
+            off = worth[i, channel] - worth[at + (j ^ first), channel]
+            off += worth[at + (j ^ first ^ second), channel] - worth[at + (j ^ second), channel]
+            total += off * off
+        shapes += 1
+    return total / (shapes * size)
 
 
 @jit
-def solve_queries(scene, ids, point, normal, level, target, first, count, bounces, seed, mean, m2, paths):
-    """Irradiance at queries in frame coordinates, from `count` paths from number `first` on; fills mean, m2, paths."""
+def net_variance(worth, at, size, channel):
+    """Variance that a path of the net from row `at` on would have if independent paths were as far off as this net is.
+
+    How the differences shrank from nets of a quarter of the size is taken to go on: by half at edges of light, at most.
+    """
+    if size == 2:
+        return 0.5 * (worth[at, channel] - worth[at + 1, channel]) ** 2
+    many = 2 if size & NOT_SQUARE else 3
+    fine, coarse, quarter = mixed_differences(worth, at, size, channel, many), 0.0, size // 4
+    if quarter < 4:
+        return fine
+    for k in range(4):
+        coarse += 0.25 * mixed_differences(worth, at + k * quarter, quarter, channel, many)
+    return fine if fine >= coarse else max(0.5, fine / coarse) * fine
+
+
+@jit
+def spread(worth, first, sky, channel):
+    """m2 of the mean worth of paths number `first` on, so that stderr² = m2 / (count (count - 1)).
+
+    The range is cut into nets. What no path met is added: features too small to be found change the light by UNSEEN of
+    what one path brings in the mean, or from the sky.
+    """
+    count = worth.shape[0]
+    total, known, mean, at = 0.0, 0, 0.0, 0
+    while at < count:
+        size = net_size(first + at, count - at)
+        if size > 1:
+            total += size * net_variance(worth, at, size, channel)
+            known += size
+        at += size
+    if known == 0 and count == 2:
+        total, known = (worth[0, channel] - worth[1, channel]) ** 2, 2
+    for i in range(count):
+        mean += worth[i, channel] / count
+    unseen = (UNSEEN * max(mean, sky)) ** 2
+    return (total * count / max(known, 1) + unseen) * (count - 1) / count
+
+
+@jit
+def solve_queries(scene, ids, point, normal, level, target, first, bounces, seed, worth, mean, m2, paths):
+    """Irradiance at queries in frame coordinates, from a path for each row of `worth`, from number `first` on.
+
+    Fills mean, m2 and paths; `worth` is theirs to write into.
+    """
+    count = worth.shape[0]
     for i in range(ids.shape[0]):
         x, n = (point[i, 0], point[i, 1], point[i, 2]), (normal[i, 0], normal[i, 1], normal[i, 2])
         if n[0] == 0.0 and n[1] == 0.0 and n[2] == 0.0:
@@ -812,9 +846,14 @@ def solve_queries(scene, ids, point, normal, level, target, first, count, bounce
         if face == LOST or buried(scene, level[i], x, n, target[i]):
             continue
         key = stream(seed, ids[i])
-        r, g, b, off_r, off_g, off_b = mean_worth(scene, key, first, count, bounces, level[i], target[i], face, x, n)
-        mean[i, 0], mean[i, 1], mean[i, 2] = np.pi * r, np.pi * g, np.pi * b
-        m2[i, 0], m2[i, 1], m2[i, 2] = np.pi**2 * off_r, np.pi**2 * off_g, np.pi**2 * off_b
+        for k in range(count):
+            worth[k] = walk(scene, key, np.uint64(first + k), bounces, level[i], target[i], face, x, n)
+        for channel in range(3):
+            total = 0.0
+            for k in range(count):
+                total += worth[k, channel]
+            mean[i, channel] = np.pi * total / count
+            m2[i, channel] = np.pi**2 * spread(worth, first, scene.background[channel], channel)
         paths[i] = count
 
 

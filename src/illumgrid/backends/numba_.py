@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from illumgrid.errors import BadInput
 from illumgrid.levelset import in_frame, marchable
-from illumgrid.samples import Queries, Samples, check_request
+from illumgrid.samples import LONGEST, Queries, Samples, check_request, combine, halves
 from illumgrid.scene import Scene
 from illumgrid.stages import Backend, hookimpl
 
@@ -52,6 +52,9 @@ class Numba:
     def solve(self, scene: Scene, queries: Queries, *, paths: range, bounces: int, seed: int) -> Samples:
         """Trace paths from every query: see `illumgrid.stages.Backend`."""
         check_request(paths, bounces)
+        if len(paths) > LONGEST:
+            parts = (self.solve(scene, queries, paths=part, bounces=bounces, seed=seed) for part in halves(paths))
+            return combine(*parts)
         n = len(queries)
         mean, m2 = np.zeros((n, 3), np.float32), np.zeros((n, 3), np.float32)
         count = np.zeros(n, np.int32)
@@ -71,7 +74,7 @@ class Numba:
             with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
                 solve_queries(
                     surfaces, queries.id[rows], point[rows], normal[rows], level[rows], queries.target[rows],
-                    paths.start, len(paths), bounces, np.uint64(seed), light, spread, good,
+                    paths.start, bounces, np.uint64(seed), np.empty((len(paths), 3)), light, spread, good,
                 )  # fmt: skip
             mean[rows], m2[rows], count[rows] = light, spread, good
 

@@ -4,7 +4,6 @@ The path loop has the headings of `kernels.walk`; everything that Numba's kernel
 meet is handed in: the trilinear level set here, its mesh in `embree`.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import ClassVar, Literal, Protocol
@@ -13,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from illumgrid.levelset import Marchable, in_frame, marchable
-from illumgrid.rng import draw, draw_pair, net_size, partner, stream
-from illumgrid.samples import Queries, Samples, check_request
+from illumgrid.rng import draw, draw_pair, net_size, sharing, stream
+from illumgrid.samples import LONGEST, Queries, Samples, check_request, combine, halves
 from illumgrid.scene import Scene
 from illumgrid.stages import Backend, hookimpl
 from illumgrid.volume import ON_A_VOXEL, Floats
@@ -379,18 +378,44 @@ def walk(
     return worth
 
 
-def couples(paths: range) -> Iterator[tuple[int, int | None]]:
-    """Paths by twos that share a box of their net; two that are left, too; one alone is (path, None)."""
-    alone = []
-    at = paths.start
-    while at < paths.stop:
-        size = net_size(at, paths.stop - at)
-        if size == 1:
-            alone.append(at)
-        yield from ((at + i, at + (i ^ partner(size))) for i in range(size // 2))
+def mixed_differences(worth: Floats, many: int) -> Floats:
+    """Variance (n, 3) of a path as four of a net (paths, n, 3) in one box tell it: `kernels.mixed_differences`."""
+    last = len(worth).bit_length() - 3
+    i, squarest = np.arange(len(worth) // 4), (last + 1) // 2
+    shapes = []
+    for a in range(max(0, squarest - 1), min(last, squarest - 2 + many) + 1):
+        first, second = sharing(a + 1, last - a), sharing(a, last - a + 1)
+        off = worth[i] - worth[i ^ first] - worth[i ^ second] + worth[i ^ first ^ second]
+        shapes.append((off**2).mean(axis=0) / 4)
+    return np.asarray(np.mean(shapes, axis=0))
+
+
+def net_variance(worth: Floats) -> Floats:
+    """Variance (n, 3) of independent paths that would be as far off as a net (paths, n, 3): `kernels.net_variance`."""
+    if len(worth) == 2:
+        return np.asarray((worth[0] - worth[1]) ** 2 / 2)
+    many = 2 if len(worth) > 64 and len(worth).bit_length() % 2 == 0 else 3
+    fine = mixed_differences(worth, many)
+    if len(worth) < 16:
+        return fine
+    coarse = np.mean([mixed_differences(part, many) for part in np.split(worth, 4)], axis=0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(fine >= coarse, fine, np.maximum(0.5, fine / coarse) * fine)
+
+
+def spread(worth: Floats, first: int, sky: Floats) -> Floats:
+    """The m2 (n, 3) of the mean of paths (paths, n, 3) number `first` on, under a sky (3,): `kernels.spread`."""
+    count, total, known, at = len(worth), np.zeros(worth.shape[1:]), 0, 0
+    while at < count:
+        size = net_size(first + at, count - at)
+        if size > 1:
+            total += size * net_variance(worth[at : at + size])
+            known += size
         at += size
-    if alone:
-        yield alone[0], alone[1] if len(alone) == 2 else None
+    if known == 0 and count == 2:
+        total, known = (worth[0] - worth[1]) ** 2, 2
+    unseen = (0.2 * np.maximum(worth.mean(axis=0), sky)) ** 2
+    return np.asarray((total * count / max(known, 1) + unseen) * (count - 1) / count)
 
 
 def answer(
@@ -406,21 +431,20 @@ def answer(
     good = normal.any(axis=1) & (face != LOST)
     for f in range(len(surfaces.scene.start)):
         good &= (target == f) | ~surfaces.inside(f, level[:, f], x, normal)
-    start, n = (level[good], target[good], face[good], x[good], normal[good]), int(good.sum())
-    pairs = list(couples(paths))
-    step = max(1, BATCH // (2 * max(n, 1)))
-    coupled = 0
-    for at in range(0, len(pairs), step):
-        block = np.array([p for pair in pairs[at : at + step] for p in pair if p is not None], np.uint64)
+    asked = np.flatnonzero(good) if len(paths) else np.zeros(0, np.int64)
+    step = max(1, BATCH // max(len(paths), 1))
+    for at in range(0, len(asked), step):
+        rows = asked[at : at + step]
+        every = np.repeat(rows, len(paths))
+        block = np.tile(np.arange(paths.start, paths.stop, dtype=np.uint64), len(rows))
         with np.errstate(over="ignore"):  # the random numbers wrap around, on purpose
-            every = np.repeat(np.arange(n), len(block))
-            light = walk(surfaces, key[good][every], np.tile(block, n), bounces, *(part[every] for part in start))
-        light = np.pi * light.reshape(n, len(block), 3)
-        mean[good] += light.sum(axis=1) / len(paths)
-        even = len(block) // 2 * 2
-        m2[good] += ((light[:, 0:even:2] - light[:, 1:even:2]) ** 2).sum(axis=1)
-        coupled += even
-    return mean, m2 * (len(paths) - 1) / max(coupled, 1), good
+            light = walk(
+                surfaces, key[every], block, bounces, level[every], target[every], face[every], x[every], normal[every]
+            )
+        light = light.reshape(len(rows), len(paths), 3).swapaxes(0, 1)
+        mean[rows] = np.pi * light.mean(axis=0)
+        m2[rows] = np.pi**2 * spread(light, paths.start, surfaces.scene.background)
+    return mean, m2, good
 
 
 @dataclass(frozen=True)
@@ -433,6 +457,9 @@ class Reference:
     def solve(self, scene: Scene, queries: Queries, *, paths: range, bounces: int, seed: int) -> Samples:
         """Trace paths from every query: see `illumgrid.stages.Backend`."""
         check_request(paths, bounces)
+        if len(paths) > LONGEST:
+            parts = (self.solve(scene, queries, paths=part, bounces=bounces, seed=seed) for part in halves(paths))
+            return combine(*parts)
         point, normal, level = in_frame(scene, queries)
         with np.errstate(over="ignore"):
             key = stream(np.uint64(seed), queries.id)
