@@ -127,7 +127,10 @@ def _measure(case: Case, backend: Backend, paths: int, seed: int) -> tuple[Float
             for s in (seed, seed + 1)
         )
         good = (one.paths > 0) & (other.paths > 0)
-        light, bar = 0.5 * (one.mean.astype(float) + other.mean), 0.5 * np.hypot(one.stderr, other.stderr, dtype=float)
+        light, bar = (
+            0.5 * (one.mean.astype(float) + other.mean.astype(float)),
+            0.5 * np.hypot(one.stderr, other.stderr, dtype=float),
+        )
         # Bars allow for what few paths may have missed; how far two seeds are apart tells the noise that there is.
         apart = 0.5 * (one.mean.astype(float) - other.mean)[good]
         share = min(1.0, np.sqrt((apart**2).sum() / (bar[good] ** 2).sum())) if good.any() and apart.any() else 0.0
