@@ -136,6 +136,10 @@ def test_a_case_without_noise_is_judged_by_its_bound_alone():
     assert not judge(off, Numba(), 1000, 0, 4.0, 5.0).agrees
 
 
+def test_the_largest_seed_has_another_beside_it():
+    assert [row.agrees for row in check(["numba"], 1000, 2**64 - 1, [analytic.plane()])] == [True]
+
+
 def test_sidak_corrects_for_the_number_of_tests():
     assert sidak(1, 0.05) == pytest.approx(1.95996, abs=1e-5)
     assert sidak(100, 0.05) == pytest.approx(3.4739, abs=1e-3)

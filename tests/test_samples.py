@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 
+import illumgrid as ig
+from illumgrid import samples as samples_of
 from illumgrid.samples import Queries, Samples, check_request, combine, join_queries, join_samples
 from illumgrid.scene import Field, Scene
 from illumgrid.volume import Volume, interpolate, world_to_index
@@ -173,6 +175,22 @@ def test_two_ranges_of_paths_combine_to_that_of_all():
         np.testing.assert_allclose(both.mean, whole.mean, rtol=1e-6)
         np.testing.assert_allclose(both.m2, whole.m2, rtol=1e-5)
         assert both.paths.tolist() == [30] * 5
+
+
+@pytest.mark.parametrize("stage", ["numba", "reference"])
+def test_more_paths_than_are_held_at_once_are_answered_in_turn(stage, monkeypatch):
+    monkeypatch.setattr(samples_of, "LONGEST", 16)
+    scene, backend = sky(), ig.backend(stage)
+    asked = Queries.at(scene, shell(4))
+    whole = backend.solve(scene, asked, paths=range(8, 50), bounces=1, seed=3)
+    parts = [
+        backend.solve(scene, asked, paths=p, bounces=1, seed=3) for p in (range(8, 24), range(24, 40), range(40, 50))
+    ]
+    by_hand = combine(combine(parts[0], parts[1]), parts[2])
+    np.testing.assert_array_equal(whole.paths, by_hand.paths)
+    np.testing.assert_array_equal(whole.mean, by_hand.mean)
+    np.testing.assert_array_equal(whole.m2, by_hand.m2)
+    assert (whole.paths == 42).all()
 
 
 def test_nothing_and_nothing_combine_to_a_hole():

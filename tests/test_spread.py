@@ -41,18 +41,27 @@ def test_three_implementations_agree(paths, sky):
         for c in range(3):
             loops = naive.spread(worth[:, query, c].tolist(), paths.start, sky)
             assert math.isclose(told[query, c], loops, rel_tol=1e-12, abs_tol=1e-300)
-            assert math.isclose(kernels.spread(worth[:, query].copy(), paths.start, sky, c), loops, rel_tol=1e-12)
+            mean, m2 = kernels.moments(worth[:, query].copy(), paths.start, sky, c)
+            assert math.isclose(mean, worth[:, query, c].mean(), rel_tol=1e-12)
+            assert math.isclose(m2, loops, rel_tol=1e-12, abs_tol=1e-300)
 
 
 def test_of_independent_worths_it_is_the_usual_one():
-    random = np.random.default_rng(1).normal(size=(2048, 1000, 1))
+    random = np.random.default_rng(1).normal(size=(2048, 4000, 1))
     for paths in (range(2), range(1, 3), range(3), range(4, 12), range(4, 9)):
         m2 = reference.spread(random[: len(paths)] - random[: len(paths)].mean(axis=0), paths.start, np.zeros(1))
         assert abs(m2.mean() / (len(paths) - 1) - 1) < 6 * m2.std() / (len(paths) - 1) / math.sqrt(m2.size)
-    for paths, least in ((range(64), 0.8), (range(3, 40), 0.8), (range(2048), 0.95)):
-        # Chance makes nets of a quarter the size worse now and then, never better: up to a fifth is lost.
+    for paths, least in ((range(16), 0.82), (range(64), 0.88), (range(3, 40), 0.9), (range(2048), 0.965)):
+        # Nets of a quarter of the size may be worse by chance, which is taken for a trend: up to a seventh is lost.
         m2 = reference.spread(random[: len(paths)] - random[: len(paths)].mean(axis=0), paths.start, np.zeros(1))
         assert least < m2.mean() / (len(paths) - 1) < 1.01
+
+
+def test_four_paths_by_hand():
+    # The box holds all four; paths 0 and 2 share a half of the first number, 0 and 3 one of the second.
+    mixed, unseen = (1 - 4 - 9 + 2) ** 2 / 4, 0.2 * 4.0
+    expected = 4 * 3 * (mixed / 4 + (unseen / 4) ** 2)
+    assert naive.spread([1.0, 2.0, 4.0, 9.0], 0, 0.5) == pytest.approx(expected, rel=1e-14)
 
 
 @pytest.mark.parametrize("m", [6, 7, 8])
@@ -64,23 +73,27 @@ def test_what_changes_along_one_number_is_no_noise(m):
     assert (reference.net_variance(worth * np.random.default_rng(0).random(worth.shape)) > 0.1).all()
 
 
-# Ranges of several nets add as if independent.
 @pytest.mark.parametrize(
-    ("paths", "most"),
-    [(range(32), 1.5), (range(64), 1.5), (range(64, 128), 1.5), (range(128), 1.5), (range(1024), 1.5),
-     (range(17, 117), 2.0)], ids=str,
-)  # fmt: skip
-def test_the_edge_of_light(paths, most):
-    u, v = net(paths)
+    ("paths", "gain"),
+    [(range(16), 3), (range(32), 5), (range(64), 7), (range(64, 128), 7), (range(17, 117), 3), (range(1024), 25)],
+    ids=str,
+)
+def test_points_beat_chance_at_an_edge_of_light_and_their_bars_tell(paths, gain):
+    u, v = net(paths, 3000)
     worth, truth = 1.0 * (u + 0.7 * v < 0.8), 0.8 - 0.35
     off, bar = worth.mean(axis=0) - truth, stderr(worth, paths)
-    rms = math.sqrt((off**2).mean())
-    assert truth * (1 - truth) / len(paths) > 3 * rms**2
+    square = (off**2).mean()
+    assert truth * (1 - truth) / len(paths) > gain * square
+    assert 0.95 < math.sqrt((bar**2).mean() / square) < 2.0
     assert (np.abs(off) <= 1.96 * bar).mean() >= 0.9
-    assert 0.9 < np.median(bar) / rms < most
+    if len(paths) >= 32 and rng.net_size(paths.start, len(paths)) == len(paths):  # several nets add as if independent
+        assert np.median(bar) < 1.5 * math.sqrt(square)
 
 
-@pytest.mark.parametrize("share", [0.03, 0.1, 0.3])
+missed = pytest.mark.xfail(strict=True, reason="a lone opening of about a path's share is missed too often for its bar")
+
+
+@pytest.mark.parametrize("share", [0.03, 0.1, 0.3, *(pytest.param(s, marks=missed) for s in (0.5, 0.7, 0.9, 1.2)), 2.0])
 def test_light_that_no_path_met_is_within_the_bar(share):
     """An opening of `share` of a path's box, dark before a bright sky or bright in the dark."""
     paths = range(64)

@@ -1,7 +1,9 @@
 """The questions put to a light-transport backend, and its answers."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import reduce, wraps
+from typing import Any, TypeVar, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -9,6 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 from illumgrid.errors import BadInput
 from illumgrid.scene import Scene
 from illumgrid.volume import Floats, index_to_world, interpolate, outward_normals, project, world_to_index
+
+_Solve = TypeVar("_Solve", bound=Callable[..., "Samples"])
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,16 +149,6 @@ def check_request(paths: range, bounces: int) -> None:
         raise BadInput(f"{bounces} bounces were asked for; expected 0 (light straight from the sky) or more")
 
 
-LONGEST = 1 << 16
-"""Paths that a backend of this package follows in one go: it keeps what each is worth."""
-
-
-def halves(paths: range) -> tuple[range, range]:
-    """The range in two, the first a power of two and at least as long."""
-    cut = 1 << (len(paths) - 1).bit_length() - 1
-    return paths[:cut], paths[cut:]
-
-
 def combine(one: Samples, other: Samples) -> Samples:
     """Merge the answers of two disjoint ranges of paths to the same queries, as if independent.
 
@@ -171,6 +165,22 @@ def combine(one: Samples, other: Samples) -> Samples:
     mean = one.mean + apart * b / total
     m2 = one.m2.astype(float) + other.m2 + apart**2 * a * b / total
     return Samples(one.queries, mean.astype(np.float32), m2.astype(np.float32), one.paths + other.paths)
+
+
+LONGEST = 1 << 16
+"""Paths that a backend of this package follows in one go: it keeps what each is worth."""
+
+
+def in_turn(solve: _Solve) -> _Solve:
+    """Check what is asked of a `Backend.solve`, and have it answer no more than `LONGEST` paths at once."""
+
+    @wraps(solve)
+    def checked(self: Any, scene: Any, queries: Queries, *, paths: range, bounces: int, seed: int) -> Samples:
+        check_request(paths, bounces)
+        parts = [paths[i : i + LONGEST] for i in range(0, len(paths), LONGEST)] or [paths]
+        return reduce(combine, (solve(self, scene, queries, paths=part, bounces=bounces, seed=seed) for part in parts))
+
+    return cast(_Solve, checked)
 
 
 def join_queries(parts: Sequence[Queries]) -> Queries:

@@ -12,6 +12,7 @@ from illumgrid import registry
 from illumgrid.analytic import CASES, Case
 from illumgrid.errors import BadInput
 from illumgrid.stages import Backend
+from illumgrid.truth import apart
 from illumgrid.volume import Floats
 
 Bools = NDArray[np.bool_]
@@ -124,7 +125,7 @@ def _measure(case: Case, backend: Backend, paths: int, seed: int) -> tuple[Float
     if case.area is None:
         one, other = (
             backend.solve(case.scene, case.queries, paths=range(count // 2), bounces=case.bounces, seed=s)
-            for s in (seed, seed + 1)
+            for s in (seed, apart(seed))
         )
         good = (one.paths > 0) & (other.paths > 0)
         light, bar = (
@@ -132,8 +133,8 @@ def _measure(case: Case, backend: Backend, paths: int, seed: int) -> tuple[Float
             0.5 * np.hypot(one.stderr, other.stderr, dtype=float),
         )
         # Bars allow for what few paths may have missed; how far two seeds are apart tells the noise that there is.
-        apart = 0.5 * (one.mean.astype(float) - other.mean)[good]
-        share = min(1.0, np.sqrt((apart**2).sum() / (bar[good] ** 2).sum())) if good.any() and apart.any() else 0.0
+        off = 0.5 * (one.mean.astype(float) - other.mean)[good]
+        share = min(1.0, np.sqrt((off**2).sum() / (bar[good] ** 2).sum())) if good.any() and off.any() else 0.0
         return light, bar, good, float(share)
     answer = backend.solve(case.scene, case.queries, paths=range(count), bounces=case.bounces, seed=seed)
     light, good = answer.mean.astype(float), answer.paths > 0

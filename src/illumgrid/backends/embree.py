@@ -31,7 +31,7 @@ from illumgrid.backends.reference import (
 from illumgrid.errors import BadInput
 from illumgrid.levelset import in_frame
 from illumgrid.rng import stream
-from illumgrid.samples import LONGEST, Queries, Samples, check_request, combine, halves
+from illumgrid.samples import Queries, Samples, in_turn
 from illumgrid.scene import Scene
 from illumgrid.stages import Backend, hookimpl
 from illumgrid.volume import Floats
@@ -196,12 +196,9 @@ class Embree:
         """None, or what would make it so."""
         return None if importlib.util.find_spec("embreex") else "pip install embreex"
 
+    @in_turn
     def solve(self, scene: Scene, queries: Queries, *, paths: range, bounces: int, seed: int) -> Samples:
         """Trace paths from every query: see `illumgrid.stages.Backend`."""
-        check_request(paths, bounces)
-        if len(paths) > LONGEST:
-            parts = (self.solve(scene, queries, paths=part, bounces=bounces, seed=seed) for part in halves(paths))
-            return combine(*parts)
         n = len(queries)
         mean, m2 = np.zeros((n, 3), np.float32), np.zeros((n, 3), np.float32)
         count = np.zeros(n, np.int32)

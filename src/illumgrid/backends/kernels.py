@@ -809,14 +809,16 @@ def net_variance(worth, at, size, channel):
 
 
 @jit
-def spread(worth, first, sky, channel):
-    """m2 of the mean worth of paths number `first` on, so that stderr² = m2 / (count (count - 1)).
+def moments(worth, first, sky, channel):
+    """Mean worth of paths number `first` on, and its m2, so that stderr² = m2 / (count (count - 1)).
 
     The range is cut into nets. What no path met is added: features too small to be found change the light by UNSEEN of
     what one path brings in the mean, or from the sky.
     """
     count = worth.shape[0]
     total, known, mean, at = 0.0, 0, 0.0, 0
+    for i in range(count):
+        mean += worth[i, channel] / count
     while at < count:
         size = net_size(first + at, count - at)
         if size > 1:
@@ -825,10 +827,8 @@ def spread(worth, first, sky, channel):
         at += size
     if known == 0 and count == 2:
         total, known = (worth[0, channel] - worth[1, channel]) ** 2, 2
-    for i in range(count):
-        mean += worth[i, channel] / count
     unseen = (UNSEEN * max(mean, sky)) ** 2
-    return (total * count / max(known, 1) + unseen) * (count - 1) / count
+    return mean, (total * count / max(known, 1) + unseen) * (count - 1) / count
 
 
 @jit
@@ -849,11 +849,8 @@ def solve_queries(scene, ids, point, normal, level, target, first, bounces, seed
         for k in range(count):
             worth[k] = walk(scene, key, np.uint64(first + k), bounces, level[i], target[i], face, x, n)
         for channel in range(3):
-            total = 0.0
-            for k in range(count):
-                total += worth[k, channel]
-            mean[i, channel] = np.pi * total / count
-            m2[i, channel] = np.pi**2 * spread(worth, first, scene.background[channel], channel)
+            mean_worth, off = moments(worth, first, scene.background[channel], channel)
+            mean[i, channel], m2[i, channel] = np.pi * mean_worth, np.pi**2 * off
         paths[i] = count
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from illumgrid.errors import BadInput
 from illumgrid.levelset import in_frame, marchable
-from illumgrid.samples import LONGEST, Queries, Samples, check_request, combine, halves
+from illumgrid.samples import Queries, Samples, in_turn
 from illumgrid.scene import Scene
 from illumgrid.stages import Backend, hookimpl
 
@@ -49,12 +49,9 @@ class Numba:
         if self.surface not in ("auto", "levelset", "mesh"):
             raise BadInput(f"the surface is {self.surface!r}; expected 'auto', 'levelset' or 'mesh'")
 
+    @in_turn
     def solve(self, scene: Scene, queries: Queries, *, paths: range, bounces: int, seed: int) -> Samples:
         """Trace paths from every query: see `illumgrid.stages.Backend`."""
-        check_request(paths, bounces)
-        if len(paths) > LONGEST:
-            parts = (self.solve(scene, queries, paths=part, bounces=bounces, seed=seed) for part in halves(paths))
-            return combine(*parts)
         n = len(queries)
         mean, m2 = np.zeros((n, 3), np.float32), np.zeros((n, 3), np.float32)
         count = np.zeros(n, np.int32)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from illumgrid.levelset import Marchable, in_frame, marchable
 from illumgrid.rng import draw, draw_pair, net_size, sharing, stream
-from illumgrid.samples import LONGEST, Queries, Samples, check_request, combine, halves
+from illumgrid.samples import Queries, Samples, in_turn
 from illumgrid.scene import Scene
 from illumgrid.stages import Backend, hookimpl
 from illumgrid.volume import ON_A_VOXEL, Floats
@@ -23,6 +23,7 @@ Ints = NDArray[np.int64]
 
 MISS, SURFACE, CAP, BURIED, QUAD = 0, 1, 2, 3, 4
 NOWHERE, LOST = -1, -2
+UNSEEN = 0.2  # as in illumgrid.backends.kernels
 BATCH = 1 << 15  # rays that take a step together
 ON_A_WALL = 1e-10  # a wall reaches this share of its size farther, so that walls joined at an edge leave no gap
 _CORNERS = np.array(list(np.ndindex(2, 2, 2)))
@@ -404,7 +405,7 @@ def net_variance(worth: Floats) -> Floats:
 
 
 def spread(worth: Floats, first: int, sky: Floats) -> Floats:
-    """The m2 (n, 3) of the mean of paths (paths, n, 3) number `first` on, under a sky (3,): `kernels.spread`."""
+    """The m2 (n, 3) of the mean of paths (paths, n, 3) number `first` on, under a sky (3,): `kernels.moments`."""
     count, total, known, at = len(worth), np.zeros(worth.shape[1:]), 0, 0
     while at < count:
         size = net_size(first + at, count - at)
@@ -414,7 +415,7 @@ def spread(worth: Floats, first: int, sky: Floats) -> Floats:
         at += size
     if known == 0 and count == 2:
         total, known = (worth[0] - worth[1]) ** 2, 2
-    unseen = (0.2 * np.maximum(worth.mean(axis=0), sky)) ** 2
+    unseen = (UNSEEN * np.maximum(worth.mean(axis=0), sky)) ** 2
     return np.asarray((total * count / max(known, 1) + unseen) * (count - 1) / count)
 
 
@@ -454,12 +455,9 @@ class Reference:
     name: ClassVar[str] = "reference"
     geometry: ClassVar[Literal["mesh", "levelset", "both"]] = "levelset"
 
+    @in_turn
     def solve(self, scene: Scene, queries: Queries, *, paths: range, bounces: int, seed: int) -> Samples:
         """Trace paths from every query: see `illumgrid.stages.Backend`."""
-        check_request(paths, bounces)
-        if len(paths) > LONGEST:
-            parts = (self.solve(scene, queries, paths=part, bounces=bounces, seed=seed) for part in halves(paths))
-            return combine(*parts)
         point, normal, level = in_frame(scene, queries)
         with np.errstate(over="ignore"):
             key = stream(np.uint64(seed), queries.id)
