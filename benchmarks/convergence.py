@@ -1,7 +1,7 @@
 """How the error falls with the number of paths, and whether its bars tell: ``python benchmarks/convergence.py``.
 
-Writes the figure and the table of the page "Is it right?" (`docs/images/convergence.png`, `convergence_table.md`); a
-minute on one thread. `numba` marches four scenes. The truth is two independent means A and B of many paths each: the
+Writes the figure and the table of the page "Is it right?" (`docs/images/convergence.png`, `convergence_table.md`): two
+minutes on one thread. `numba` marches seven scenes. The truth is two independent means A and B of many paths each: the
 mean of (light - A)(light - B) is the squared error of the light, without any of theirs.
 """
 
@@ -10,6 +10,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from chart import labyrinth
+from rays import gaussians
+from stability import hills
 
 from illumgrid import Material, Scene, Volume, backend
 from illumgrid.samples import join_queries
@@ -38,6 +41,17 @@ def scenes():
         "ball on a floor, sky": Scene.floor(ball, range=(0.3, 0.9)),
         "ball in the box with a lamp": Scene.box(ball, range=(0.3, 0.9)),
         "raw noise, sky": Scene.sky(raw, range=(40, 215)),
+    }
+
+
+def others():
+    """More scenes for the bars: light of all lamps and walls, noise on a smooth field, and hardly any shadow."""
+    smooth, slight = gaussians(32), hills(24)
+    noise = np.random.default_rng(0).normal(scale=0.03, size=smooth.values.shape)
+    return {
+        "labyrinth in the box with a lamp": Scene.box(labyrinth(32), range=(-0.4, 0.4)),
+        "noisy Gaussians, sky": Scene.sky(Volume(smooth.values + noise), range=(0.3, 1.0)),
+        "hills, nearly all sky": Scene.sky(slight, range=(0.15, 0.75)),
     }
 
 
@@ -103,10 +117,11 @@ def slope(error):
 
 def main():
     curves, lines = {}, ["| scene | paths | covered | median bar / RMS error |", "|---|---|---|---|"]
-    for name, scene in scenes().items():
-        curves[name] = curve(scene)
-        told = "  ".join(f"{n}: {e:.3%}" for n, e in zip(COUNTS, curves[name]))
-        print(f"{name}: paths^{slope(curves[name]):.2f}   {told}", flush=True)
+    for name, scene in {**scenes(), **others()}.items():
+        if name in scenes():
+            curves[name] = curve(scene)
+            told = "  ".join(f"{n}: {e:.3%}" for n, e in zip(COUNTS, curves[name]))
+            print(f"{name}: paths^{slope(curves[name]):.2f}   {told}", flush=True)
         truths = [light(scene, asked(scene, WIDE[1]), WIDE[0], 1000 + k) for k in (0, 1)]
         for paths in (16, 32, 64, 256):
             covered, ratio = bars(scene, paths, truths)
