@@ -847,7 +847,8 @@ def solve_queries(scene, ids, point, normal, level, target, first, bounces, seed
             continue
         key = stream(seed, ids[i])
         for k in range(count):
-            worth[k] = walk(scene, key, np.uint64(first + k), bounces, level[i], target[i], face, x, n)
+            red, green, blue = walk(scene, key, np.uint64(first + k), bounces, level[i], target[i], face, x, n)
+            worth[k, 0], worth[k, 1], worth[k, 2] = red, green, blue
         for channel in range(3):
             mean_worth, off = moments(worth, first, scene.background[channel], channel)
             mean[i, channel], m2[i, channel] = np.pi * mean_worth, np.pi**2 * off
