@@ -1,7 +1,7 @@
 """How the error falls with the number of paths, and whether its bars tell: ``python benchmarks/convergence.py``.
 
 Writes the figure and the table of the page "Is it right?" (`docs/images/convergence.png`, `convergence_table.md`): two
-minutes on one thread. `numba` marches seven scenes. The truth is two independent means A and B of many paths each: the
+minutes on one thread. `numba` marches nine scenes. The truth is two independent means A and B of many paths each: the
 mean of (light - A)(light - B) is the squared error of the light, without any of theirs.
 """
 
@@ -14,7 +14,7 @@ from chart import labyrinth
 from rays import gaussians
 from stability import hills
 
-from illumgrid import Material, Scene, Volume, backend
+from illumgrid import Material, Quad, Scene, Volume, backend
 from illumgrid.samples import join_queries
 from illumgrid.stages import on_level_sets
 
@@ -46,13 +46,26 @@ def scenes():
 
 def others():
     """More scenes for the bars: light of all lamps and walls, noise on a smooth field, and hardly any shadow."""
-    smooth, slight = gaussians(32), hills(24)
+    smooth, slight, maze = gaussians(32), hills(24), Scene.floor(labyrinth(24), range=(-0.4, 0.4))
     noise = np.random.default_rng(0).normal(scale=0.03, size=smooth.values.shape)
     return {
         "labyrinth in the box with a lamp": Scene.box(labyrinth(32), range=(-0.4, 0.4)),
+        "labyrinth, dim sky, two small lamps": replace(
+            maze, quads=(*maze.quads, *small_lamps(maze)), background=np.full(3, 0.1)
+        ),
+        "hills in the box with a lamp": Scene.box(slight, range=(0.15, 0.75)),
         "noisy Gaussians, sky": Scene.sky(Volume(smooth.values + noise), range=(0.3, 1.0)),
         "hills, nearly all sky": Scene.sky(slight, range=(0.15, 0.75)),
     }
+
+
+def small_lamps(scene):
+    """Two lamps above the field, a hundredth of its extent in area."""
+    volume = scene.fields[0].volume
+    size = np.array(volume.shape) * volume.spacing
+    edge, glow = 0.12 * size.max(), Material(np.zeros(3), np.full(3, 30.0))
+    for number, share in enumerate(((0.1, 0.2, 1.4), (0.8, 0.7, 1.4))):
+        yield Quad(f"lamp {number}", volume.origin + share * size, np.array([0, edge, 0]), np.array([edge, 0, 0]), glow)
 
 
 def asked(scene, count):

@@ -459,7 +459,9 @@ def solve(scene, queries, paths, bounces, seed):
             continue
         light = np.array([math.pi * path_worth(scene, query, path, bounces, seed) for path in paths])
         mean[i], count[i] = light.mean(axis=0), len(paths)
-        m2[i] = [spread(list(light[:, c]), paths.start, math.pi * scene.background[c]) for c in range(3)]
+        m2[i] = [
+            spread(list(light[:, c]), paths.start, math.pi * scene.background[c], lamplight(scene, c)) for c in range(3)
+        ]
     return mean, m2, count
 
 
@@ -497,13 +499,31 @@ def net_variance(worth):
     return fine * max(0.5, fine / coarse)
 
 
-def spread(worth, first, sky):
-    """The m2 of the light of paths number `first` on (a list), under a sky of that irradiance."""
+def lamplight(scene, channel):
+    """Irradiance from all lamps, were their power spread over a box around the scene, along the axes of field 0."""
+    points = []
+    for volume in (field.volume for field in scene.fields):
+        points += [volume.origin, volume.origin + volume.direction @ (volume.spacing * (np.array(volume.shape) - 1))]
+    for quad in scene.quads:
+        far = quad.corner + quad.edge_u + quad.edge_v
+        points += [quad.corner, quad.corner + quad.edge_u, quad.corner + quad.edge_v, far]
+    along = [[float(np.dot(point, axis)) for point in points] for axis in scene.fields[0].volume.direction.T]
+    a, b, c = (max(places) - min(places) for places in along)
+    flux = sum(
+        math.pi * quad.material.emission[channel] * np.linalg.norm(np.cross(quad.edge_u, quad.edge_v))
+        for quad in scene.quads
+    )
+    return float(flux / (2 * (a * b + b * c + c * a)))
+
+
+def spread(worth, first, sky, lamps):
+    """The m2 of the light of paths number `first` on (a list), under a sky and lamps of these irradiances."""
     count, nets = len(worth), []
     while sum(map(len, nets)) < count:
         at = sum(map(len, nets))
         nets.append(worth[at : at + net_size(first + at, count - at)])
     told = [net for net in nets if len(net) > 1] or ([worth] if count == 2 else [])
     per_path = sum(len(net) * net_variance(net) for net in told) / max(1, sum(map(len, told)))
-    unseen = 0.2 * max(sum(worth) / count, sky) / count
-    return count * (count - 1) * (per_path / count + unseen**2)
+    usual = max(sum(worth) / count, sky)
+    one_more = math.hypot(0.2 * usual, max(worth) - min(usual, max(worth)), lamps)
+    return count * (count - 1) * (per_path / count + (one_more / count) ** 2)

@@ -26,22 +26,22 @@ def net(paths, queries=2000):
     return u[..., None], v[..., None]
 
 
-def stderr(worth, paths, sky=0.0):
+def stderr(worth, paths, sky=0.0, lamps=0.0):
     n = len(paths)
-    return np.sqrt(reference.spread(worth, paths.start, np.full(1, sky)) / (n * (n - 1)))
+    return np.sqrt(reference.spread(worth, paths.start, np.full(1, sky), np.full(1, lamps)) / (n * (n - 1)))
 
 
 @pytest.mark.parametrize("paths", RANGES, ids=str)
-@pytest.mark.parametrize("sky", [0.0, 3.0])
-def test_three_implementations_agree(paths, sky):
+@pytest.mark.parametrize(("sky", "lamps"), [(0.0, 0.0), (3.0, 0.0), (0.5, 2.0)])
+def test_three_implementations_agree(paths, sky, lamps):
     worth = np.random.default_rng(1).exponential(size=(len(paths), 3, 3)) ** 3
     worth[:, 2] = np.round(worth[:, 2], 1)
-    told = reference.spread(worth, paths.start, np.full(3, sky))
+    told = reference.spread(worth, paths.start, np.full(3, sky), np.full(3, lamps))
     for query in range(3):
         for c in range(3):
-            loops = naive.spread(worth[:, query, c].tolist(), paths.start, sky)
+            loops = naive.spread(worth[:, query, c].tolist(), paths.start, sky, lamps)
             assert math.isclose(told[query, c], loops, rel_tol=1e-12, abs_tol=1e-300)
-            mean, m2 = kernels.moments(worth[:, query].copy(), paths.start, sky, c)
+            mean, m2 = kernels.moments(worth[:, query].copy(), paths.start, sky, lamps, c)
             assert math.isclose(mean, worth[:, query, c].mean(), rel_tol=1e-12)
             assert math.isclose(m2, loops, rel_tol=1e-12, abs_tol=1e-300)
 
@@ -49,19 +49,19 @@ def test_three_implementations_agree(paths, sky):
 def test_of_independent_worths_it_is_the_usual_one():
     random = np.random.default_rng(1).normal(size=(2048, 4000, 1))
     for paths in (range(2), range(1, 3), range(3), range(4, 12), range(4, 9)):
-        m2 = reference.spread(random[: len(paths)] - random[: len(paths)].mean(axis=0), paths.start, np.zeros(1))
-        assert abs(m2.mean() / (len(paths) - 1) - 1) < 6 * m2.std() / (len(paths) - 1) / math.sqrt(m2.size)
+        told = reference.sum_variance(random[: len(paths)], paths.start) / len(paths)
+        assert abs(told.mean() - 1) < 6 * told.std() / math.sqrt(told.size)
     for paths, least in ((range(16), 0.82), (range(64), 0.88), (range(3, 40), 0.9), (range(2048), 0.965)):
         # Nets of a quarter of the size may be worse by chance, which is taken for a trend: up to a seventh is lost.
-        m2 = reference.spread(random[: len(paths)] - random[: len(paths)].mean(axis=0), paths.start, np.zeros(1))
-        assert least < m2.mean() / (len(paths) - 1) < 1.01
+        assert least < reference.sum_variance(random[: len(paths)], paths.start).mean() / len(paths) < 1.01
 
 
 def test_four_paths_by_hand():
     # The box holds all four; paths 0 and 2 share a half of the first number, 0 and 3 one of the second.
-    mixed, unseen = (1 - 4 - 9 + 2) ** 2 / 4, 0.2 * 4.0
-    expected = 4 * 3 * (mixed / 4 + (unseen / 4) ** 2)
-    assert naive.spread([1.0, 2.0, 4.0, 9.0], 0, 0.5) == pytest.approx(expected, rel=1e-14)
+    mixed, brightest = (1 - 4 - 9 + 2) ** 2 / 4, 9.0
+    for sky, unseen in ((0.5, 0.2**2 * 4.0**2 + (brightest - 4.0) ** 2), (20.0, 0.2**2 * 20.0**2)):
+        expected = 4 * 3 * (mixed / 4 + (unseen + 0.7**2) / 4**2)
+        assert naive.spread([1.0, 2.0, 4.0, 9.0], 0, sky, 0.7) == pytest.approx(expected, rel=1e-14)
 
 
 @pytest.mark.parametrize("m", [6, 7, 8])
@@ -109,3 +109,12 @@ def test_light_that_no_path_met_is_within_the_bar(share):
 def test_a_sky_that_no_path_saw_counts():
     assert not stderr(np.zeros((64, 5, 1)), range(64)).any()
     np.testing.assert_allclose(stderr(np.zeros((64, 5, 1)), range(64), sky=3.0), 0.6 / 64)
+
+
+def test_lamps_that_no_path_saw_count_and_so_does_the_brightest_path():
+    np.testing.assert_allclose(stderr(np.zeros((64, 5, 1)), range(64), lamps=3.0), 3 / 64)
+    worth = np.zeros((64, 1, 1))
+    worth[7] = 8.0
+    nets = math.sqrt(reference.sum_variance(worth, 0).item()) / 64
+    assert stderr(worth, range(64)).item() == pytest.approx(math.hypot(nets, (8 - 8 / 64) / 64, 0.2 / 64 * 8 / 64))
+    assert stderr(worth, range(64), sky=8.0).item() == pytest.approx(math.hypot(nets, 0.2 / 64 * 8))

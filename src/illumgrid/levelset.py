@@ -114,6 +114,7 @@ class Marchable(NamedTuple):
     lamps: NDArray[np.int64]  # (L,) numbers of the quads that emit
     lamp_share: Floats  # (L,) running sum of the probability to choose a lamp, in proportion to its power
     lamp_density: Floats  # (Q,) probability to choose a point of the quad, per area; 0 if it does not emit
+    lamplight: Floats  # (3,) radiance of all lamps, were their power spread over a box around the scene
 
 
 _turned: "weakref.WeakKeyDictionary[Volume, dict[Side, tuple[NDArray[np.float32], Bricks]]]"
@@ -158,6 +159,7 @@ def marchable(scene: Scene) -> Marchable:
 def _quads_in_frame(scene: Scene) -> dict[str, NDArray[Any]]:
     """The quad and lamp arrays of a `Marchable`."""
     axes, count = scene.fields[0].volume.direction, len(scene.quads)
+    corner = scene.to_frame(np.array([q.corner for q in scene.quads]).reshape(count, 3))
     # The front is a side in the world: where the axes are mirrored it is not edge_u x edge_v of the frame.
     normal = np.array([q.normal for q in scene.quads]).reshape(count, 3) @ axes
     edges = np.array([(q.edge_u, q.edge_v) for q in scene.quads]).reshape(count, 2, 3) @ axes
@@ -166,8 +168,13 @@ def _quads_in_frame(scene: Scene) -> dict[str, NDArray[Any]]:
     power = np.array([q.material.emission.mean() * q.area for q in scene.quads]).reshape(count)
     lamps = np.flatnonzero(power > 0)
     chance = power / power.sum() if len(lamps) else power
+    boxes = [index_to_world(f.volume, [np.zeros(3), np.array(f.volume.shape) - 1.0]) for f in scene.fields]
+    ends = [scene.to_frame(np.concatenate(boxes))]
+    ends += [corner + one + other for one in (0, edges[:, 0]) for other in (0, edges[:, 1])]
+    a, b, c = np.ptp(np.concatenate(ends), axis=0)
+    flux = sum((q.material.emission * q.area for q in scene.quads), np.zeros(3))
     return {
-        "quad_corner": scene.to_frame(np.array([q.corner for q in scene.quads]).reshape(count, 3)),
+        "quad_corner": corner,
         "quad_edges": edges,
         "quad_duals": across / (edges * across).sum(axis=2, keepdims=True),
         "quad_normal": normal,
@@ -175,6 +182,7 @@ def _quads_in_frame(scene: Scene) -> dict[str, NDArray[Any]]:
         "lamps": lamps,
         "lamp_share": np.cumsum(chance[lamps]),
         "lamp_density": chance / area if count else power,
+        "lamplight": flux / (2 * (a * b + b * c + c * a)),
     }
 
 

@@ -809,16 +809,18 @@ def net_variance(worth, at, size, channel):
 
 
 @jit
-def moments(worth, first, sky, channel):
+def moments(worth, first, sky, lamplight, channel):
     """Mean worth of paths number `first` on, and its m2, so that stderr² = m2 / (count (count - 1)).
 
     The range is cut into nets. What no path met is added: features too small to be found change the light by UNSEEN of
-    what one path brings in the mean, or from the sky.
+    what one path brings in the mean, or from the sky; one more path may be as bright as the brightest that was met, or
+    as all lamps spread evenly.
     """
     count = worth.shape[0]
-    total, known, mean, at = 0.0, 0, 0.0, 0
+    total, known, mean, brightest, at = 0.0, 0, 0.0, 0.0, 0
     for i in range(count):
         mean += worth[i, channel] / count
+        brightest = max(brightest, worth[i, channel])
     while at < count:
         size = net_size(first + at, count - at)
         if size > 1:
@@ -827,7 +829,8 @@ def moments(worth, first, sky, channel):
         at += size
     if known == 0 and count == 2:
         total, known = (worth[0, channel] - worth[1, channel]) ** 2, 2
-    unseen = (UNSEEN * max(mean, sky)) ** 2
+    usual = max(mean, sky)
+    unseen = (UNSEEN * usual) ** 2 + max(0.0, brightest - usual) ** 2 + lamplight**2
     return mean, (total * count / max(known, 1) + unseen) * (count - 1) / count
 
 
@@ -850,7 +853,7 @@ def solve_queries(scene, ids, point, normal, level, target, first, bounces, seed
             red, green, blue = walk(scene, key, np.uint64(first + k), bounces, level[i], target[i], face, x, n)
             worth[k, 0], worth[k, 1], worth[k, 2] = red, green, blue
         for channel in range(3):
-            mean_worth, off = moments(worth, first, scene.background[channel], channel)
+            mean_worth, off = moments(worth, first, scene.background[channel], scene.lamplight[channel], channel)
             mean[i, channel], m2[i, channel] = np.pi * mean_worth, np.pi**2 * off
         paths[i] = count
 

@@ -404,8 +404,8 @@ def net_variance(worth: Floats) -> Floats:
         return np.where(fine >= coarse, fine, np.maximum(0.5, fine / coarse) * fine)
 
 
-def spread(worth: Floats, first: int, sky: Floats) -> Floats:
-    """The m2 (n, 3) of the mean of paths (paths, n, 3) number `first` on, under a sky (3,): `kernels.moments`."""
+def sum_variance(worth: Floats, first: int) -> Floats:
+    """Variance (n, 3) of the sum of paths (paths, n, 3) number `first` on, as the nets in that range tell it."""
     count, total, known, at = len(worth), np.zeros(worth.shape[1:]), 0, 0
     while at < count:
         size = net_size(first + at, count - at)
@@ -415,8 +415,14 @@ def spread(worth: Floats, first: int, sky: Floats) -> Floats:
         at += size
     if known == 0 and count == 2:
         total, known = (worth[0] - worth[1]) ** 2, 2
-    unseen = (UNSEEN * np.maximum(worth.mean(axis=0), sky)) ** 2
-    return np.asarray((total * count / max(known, 1) + unseen) * (count - 1) / count)
+    return np.asarray(total * count / max(known, 1))
+
+
+def spread(worth: Floats, first: int, sky: Floats, lamplight: Floats) -> Floats:
+    """The m2 (n, 3) of the mean of paths (paths, n, 3) number `first` on, in such light (3,): `kernels.moments`."""
+    count, usual = len(worth), np.maximum(worth.mean(axis=0), sky)
+    unseen = (UNSEEN * usual) ** 2 + np.maximum(0.0, worth.max(axis=0) - usual) ** 2 + lamplight**2
+    return np.asarray((sum_variance(worth, first) + unseen) * (count - 1) / count)
 
 
 def answer(
@@ -444,7 +450,7 @@ def answer(
             )
         light = light.reshape(len(rows), len(paths), 3).swapaxes(0, 1)
         mean[rows] = np.pi * light.mean(axis=0)
-        m2[rows] = np.pi**2 * spread(light, paths.start, surfaces.scene.background)
+        m2[rows] = np.pi**2 * spread(light, paths.start, surfaces.scene.background, surfaces.scene.lamplight)
     return mean, m2, good
 
 
