@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from illumgrid.backends.numba_ import Numba
-from illumgrid.bench import _remarks, bench, chart, told
+from illumgrid.bench import _remarks, _show_default, _thinned, bench, chart, told
 from illumgrid.bench import sizes as sizes_of
 from illumgrid.bench.contestants import COUNTS, Way, ways
 from illumgrid.bench.race import Point, Race, Run, covered, front
@@ -203,3 +203,70 @@ def test_run_says_what_would_help_noisy_data(call, tmp_path):
         warnings.simplefilter("ignore")
         said = call("run", "noise.npy", "--range", 0.4, 0.7, "--grid", 12, "--no-preview", "-o", "n")
     assert "note: grid: between the nodes" in said and "--smooth 1" in said
+
+
+def test_what_is_foreseen_of_a_grid_is_what_the_grid_will_hold(truth):
+    scene, exact = truth
+    race = Race(scene, {"levelset": exact}, [WAY], [9, 21], 3, 5)
+    race.foresee(WAY, 21, 8, 12.5, default=True)
+    (seen,) = race.points
+    assert seen.default and not seen.built and seen.seconds == [12.5] * 3 and seen.paths == 8
+    asked = exact.samples.queries
+    for seed, light in zip((5, 6, 7), seen.light):
+        run = Run(scene, WAY, 21, 3, seed)
+        run.go_on(8)
+        grids = run.fill(Nearest())[0]
+        whole = seen.covered & covered(grids, asked)
+        assert whole.mean() > 0.9
+        np.testing.assert_allclose(light[whole], grids[0].lookup(asked.point[whole]), rtol=1e-4, atol=1e-5)
+    assert seen.queries == len(run.answers[0]) and not race.front_ladders()  # it needs no more seeds
+    race.lanes[0].run.grid = 21
+    while lane := race.next(np.inf):
+        race.step(lane)
+    assert [p.built for p in race.points if p.paths == 8] == [True]  # what is built takes its place
+
+
+def test_runs_default_is_charted_first_and_goes_on(truth):
+    scene, exact = truth
+    race = Race(scene, {"levelset": exact}, [WAY], [5, 11], 3, 0)
+    race.show_default(WAY, 11, 64)
+    (default,) = race.points
+    assert default.default and default.built and default.paths == 64
+    while lane := race.next(np.inf):
+        race.step(lane)
+    assert {p.paths for p in race.points if p.grid == 11} <= {64, 128, 512, 2048}  # no lane starts anew beside it
+    assert sum(p.paths == 64 for p in race.points) == 1 and {p.grid for p in race.points} == {5, 11}
+
+
+def test_it_is_told_where_runs_default_stands(truth):
+    _, exact = truth
+    truths = {"levelset": exact}
+    quick, own = point(exact, 1, 0.09, 8, 16), point(exact, 14.6, 0.2, 8, 64)
+    own.default, own.built = True, False
+    records = [told.record(quick, truths, True), told.record(own, truths, False)]
+    said = told.advice(records, BARS, 5)
+    assert said[1].startswith("run's default (about 15 s, error 20.00%) is beaten by --sampler direct")
+    assert "--paths 16 --bounces 5 (1 s, error 9.00%)" in said[1]
+    table = told.table(records)
+    assert table.index("the front:") < table.index("run's default:") < table.index("~14.60")
+    records = [told.record(quick, truths, True), told.record(own, truths, True)]
+    assert "run's default (about 15 s, error 20.00%) is on the front" in told.advice(records, BARS, 5)
+
+
+def test_a_default_that_is_too_costly_is_foreseen_and_so_are_its_neighbours(truth):
+    scene, exact = truth
+    race = Race(scene, {"levelset": exact}, [WAY], [5, 11, 22], 3, 0)
+    said = _show_default(race, 11, 32, 1e-6)
+    assert "~" in said[0] and [(p.grid, p.paths, p.built) for p in race.points] == [(11, 32, False)]
+    race = Race(scene, {"levelset": exact}, [WAY], [5, 11, 22], 3, 0)
+    assert not _show_default(race, 11, 32, 1e6)
+    assert [(p.grid, p.paths, p.built) for p in race.points] == [(11, 32, True)]
+
+
+def test_points_are_given_up_for_a_sharper_truth_where_light_is_rough(truth):
+    _, exact = truth
+    assert len(_thinned(exact, "levelset", 1.0, 1e9, 0)) == len(exact)
+    many = Truth(exact.samples[np.arange(2000) % len(exact)], 8)
+    few = _thinned(many, "mesh", 1.0, 0.6 * (exact.error / 0.01) ** 2, 0)
+    assert few.surface == "mesh" and abs(len(few) - 1200) <= 1
+    assert len(_thinned(many, "mesh", 1.0, 1e-9, 0)) == 500

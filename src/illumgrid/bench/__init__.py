@@ -12,14 +12,22 @@ from illumgrid.bench.picture import Studio
 from illumgrid.bench.race import SEEDS, Point, Race, front
 from illumgrid.bench.whence import Bar, bars
 from illumgrid.errors import BadInput
-from illumgrid.pilot import Pilot
+from illumgrid.illumination import PATHS, nodes_over
+from illumgrid.pilot import Pilot, specs_of, timed
+from illumgrid.samplers.direct import Direct, reachable
 from illumgrid.samples import Queries
 from illumgrid.scene import Scene
 from illumgrid.stages import Backend
 from illumgrid.truth import Truth, begin, converge, enough, unseen_on_level_sets
 
-TRUTH, PARTS, PICTURE = 0.25, 0.12, 0.05
-"""Shares of the budget for the truth, the parts of the error and the converged picture."""
+TRUTH, PARTS, PICTURE, OTHER = 0.25, 0.12, 0.05, 0.05
+"""Shares of the budget: for the truth, the parts of the error, the converged picture, and to begin another truth."""
+
+DEFAULT, FORESEEN = 0.3, 0.15
+"""Shares of the budget, at most, for `run`'s default and, if that is too little, for what of such grids is foreseen."""
+
+GOAL, FEWEST = 0.01, 500
+"""Own error of the truth, a fifth of 5 %, for which points are given up where light is rough; so many stay at least."""
 
 LONGEST = 1e7  # seconds of a budget: four months; counts of paths in proportion to it stay whole numbers
 
@@ -54,12 +62,17 @@ class Report:
 
 
 def sizes(scene: Scene) -> list[int]:
-    """Grids that take part: 0.3, 0.6, 1.2 and 1.9 nodes for each voxel along the longest axis.
+    """Grids that take part: a quarter, half, once and 1.6 times the nodes that `run` has by default.
 
-    Not 1 or 2: nodes on voxels are the worst place to ask on noisy data (docs/stability.md).
+    Nodes on voxels are the worst place to ask on noisy data (docs/stability.md).
     """
-    longest = max(max(field.volume.shape) for field in scene.fields)
-    return sorted({max(4, round(longest * share)) for share in (0.3, 0.6, 1.2, 1.9)})
+    default = default_grid(scene)
+    return sorted({max(4, round(default * share)) for share in (0.25, 0.5, 1.0, 1.6)})
+
+
+def default_grid(scene: Scene) -> int:
+    """Nodes along the longest axis, of the field that has most, when `illumgrid.run` is asked for nothing else."""
+    return max(max(nodes_over(field.volume).shape) for field in scene.fields)
 
 
 def _unseen(scene: Scene, budget: float, seed: int) -> Queries:
@@ -71,14 +84,27 @@ def _unseen(scene: Scene, budget: float, seed: int) -> Queries:
     return unseen_on_level_sets(scene, levels, int(np.clip(100 * levels, 1200, 4000)), seed)
 
 
+def _thinned(truth: Truth, surface: str, spent: float, left: float, seed: int) -> Truth:
+    """As many of a truth's points, which took so many seconds, as can be sharpened to GOAL in the time that is left."""
+    takes = spent * (truth.error / GOAL) ** 2
+    keep = int(np.clip(len(truth) * left / max(takes, 1e-9), min(FEWEST, len(truth)), len(truth)))
+    chosen = np.sort(np.random.default_rng((seed, 4)).permutation(len(truth))[:keep])
+    return Truth(truth.samples[chosen], truth.bounces, surface)
+
+
 def _grown(
-    truths: dict[str, Truth], tracers: dict[str, Backend], scene: Scene, seed: int, error: float, left: float
+    truths: dict[str, Truth], tracers: dict[str, Backend], scene: Scene, seed: int, error: dict[str, float], left: float
 ) -> None:
-    """The truths with more paths, until their own error is small enough or the time is over."""
-    for surface, truth in truths.items():
+    """The truths with more paths, until their own errors are small enough or the time is over."""
+    end = time.perf_counter() + left
+    for rest, (surface, truth) in zip(range(len(truths), 0, -1), list(truths.items())):
         spent, begun = 0.0, time.perf_counter()
-        until = begun + left / len(truths)
-        while truth.error > error and time.perf_counter() + 2 * spent < until and truth.samples.paths[0] < 1 << 15:
+        until = begun + (end - begun) / rest
+        while (
+            truth.error > error[surface]
+            and time.perf_counter() + 2 * spent < until
+            and truth.samples.paths[0] < 1 << 15
+        ):
             step = time.perf_counter()
             paths = 2 * int(truth.samples.paths[0])
             truth = converge(truth, scene, tracers[surface], seed, 0.0, paths)
@@ -87,7 +113,11 @@ def _grown(
 
 
 def bench(
-    scene: Scene, budget: float = 120.0, seed: int = 0, progress: Progress = lambda what, done, total: None
+    scene: Scene,
+    budget: float = 120.0,
+    seed: int = 0,
+    progress: Progress = lambda what, done, total: None,
+    default: tuple[int, int] | None = None,
 ) -> Report:
     """Race all contestants on a scene.
 
@@ -99,6 +129,8 @@ def bench(
     seed : int
     progress : callable, optional
         Told (what, done, total).
+    default : (int, int), optional
+        Nodes and paths that are marked as the default of `run`; by default those of `illumgrid.run`.
 
     Raises
     ------
@@ -124,30 +156,74 @@ def bench(
     pilot = Pilot.start(scene, auto, 256, 0.02, seed, 64)
     bounces = pilot.bounces_for(0.002)
     most = enough(scene, auto, 2e-4, seed)
-    tracers = {way.surface: way.backend for way in entrants[::-1]}
-    tracing = time.perf_counter()
-    truths = {surface: begin(scene, tracer, asked, most, seed) for surface, tracer in tracers.items()}
-    pace = (time.perf_counter() - tracing) / (64 * len(asked) * len(tracers))
-    truths = {surface: Truth(truth.samples, most, surface) for surface, truth in truths.items() if len(truth)}
-    _grown(truths, tracers, scene, seed, 0.002, 0.5 * TRUTH * budget)
+    tracers: dict[str, Backend] = {}
+    for way in sorted(entrants, key=lambda way: (way.surface != "levelset", way.slow)):
+        tracers.setdefault(way.surface, way.backend)
+    truths: dict[str, Truth] = {}
+    pace: dict[str, float] = {}
+    for surface, tracer in tracers.items():
+        tracing = time.perf_counter()
+        if truths:  # meshes may take longer to build than rays to cast: try one level set
+            rows = np.unique(asked.level, axis=0)
+            begin(scene, tracer, asked[(asked.level == rows[len(rows) // 2]).all(axis=1)], most, seed, 64)
+            takes = (time.perf_counter() - tracing) * len(rows)
+            if takes > OTHER * budget:
+                notes.append(f"what traces the {surface} takes no part: its truth alone would take {takes:.0f} s")
+                continue
+            tracing = time.perf_counter()
+        truth = begin(scene, tracer, asked, most, seed, 64)
+        spent = time.perf_counter() - tracing
+        if len(truth):
+            pace[surface] = spent / (64 * len(asked))
+            truths[surface] = _thinned(truth, surface, spent, TRUTH * budget / len(tracers), seed)
+    _grown(truths, tracers, scene, seed, dict.fromkeys(truths, 4 * GOAL), 0.3 * TRUTH * budget)
     main = "levelset" if "levelset" in truths else next(iter(truths))
-    studio = Studio.open(scene, tracers[main], truths[main], seed, PICTURE * budget / pace)
+    studio = Studio.open(scene, tracers[main], truths[main], seed, PICTURE * budget / pace[main])
     race = Race(scene, truths, [way for way in entrants if way.surface in truths], sizes(scene), bounces, seed)
-    racing = (1 - 0.5 * TRUTH - PARTS) * budget
+    racing = (1 - 0.7 * TRUTH - PARTS) * budget
+    notes += _show_default(race, *(default or (default_grid(scene), PATHS)), budget)
     while lane := race.next(racing - (time.perf_counter() - begun)):
         race.step(lane)
         tell()
     if not race.points:
         raise BadInput("no contestant could finish; " + "; ".join(notes + race.notes))
     race.repeat(begun + racing, tell, studio)
-    smallest = min(p.rmse(truths[p.way.surface]) for p in race.points)
-    _grown(truths, tracers, scene, seed, smallest / 5, budget * (1 - PARTS) - (time.perf_counter() - begun))
+    least = {s: min((p.rmse(truths[s]) for p in race.points if p.way.surface == s), default=1.0) for s in truths}
+    asked_for = {surface: error / 5 for surface, error in least.items()}
+    _grown(truths, tracers, scene, seed, asked_for, budget * (1 - PARTS) - (time.perf_counter() - begun))
     parts = bars(scene, auto, sizes(scene), bounces, seed, budget - (time.perf_counter() - begun))
     best = tuple(front(race.points, truths))
     return Report(
         tuple(race.points), best, truths, tuple(parts), bounces, (*notes, *race.notes, *_remarks(best, truths)),
         time.perf_counter() - begun,
     )  # fmt: skip
+
+
+def _show_default(race: Race, grid: int, paths: int, budget: float) -> list[str]:
+    """Chart `run`'s default; if it would take too much of the budget, as it is foreseen."""
+    own = registry.backend("auto")
+    entrants = [lane.run.way for lane in race.lanes if lane.run.way.surface == "levelset"]
+    way = next((w for w in entrants if w.sampler == Direct() and w.backend.name == own.name), None)
+    if way is None:
+        return []
+    begun, pace = time.perf_counter(), timed(race.scene, own, grid, 16, race.bounces, race.seed)
+
+    def takes(size: int, count: int) -> float:
+        specs = zip(race.scene.fields, specs_of(race.scene, size))
+        return pace.seconds(sum(len(reachable(field, spec)) for field, spec in specs), count)
+
+    if takes(grid, paths) <= DEFAULT * budget:
+        race.show_default(way, grid, paths)
+        return []
+    race.foresee(way, grid, paths, takes(grid, paths), default=True)
+    more = [(takes(size, count), size, count) for size in race.sizes[1:] for count in (8, 32, 128)]
+    for seconds, size, count in sorted(more):
+        # As many nodes as those of the default, and as many seeds.
+        will = SEEDS * count * pace.path * 8 * len(race.truths["levelset"])
+        if (size, count) != (grid, paths) and time.perf_counter() - begun + will < FORESEEN * budget:
+            race.foresee(way, size, count, seconds)
+    return ["with ~ is what would take too much of the budget: its seconds are predicted, and of its nodes only those "
+            "around the points of the truth were lit"]  # fmt: skip
 
 
 def _remarks(best: tuple[Point, ...], truths: dict[str, Truth]) -> list[str]:

@@ -61,6 +61,13 @@ def race(axes: "Axes", records: Sequence[dict[str, Any]]) -> None:
         axes.errorbar([r["seconds"] for r in sure], [100 * r["rmse"] for r in sure],
                       xerr=[r["seconds_spread"] for r in sure], yerr=[100 * r["rmse_spread"] for r in sure],
                       fmt="none", ecolor="black", elinewidth=1, capsize=2, zorder=4)  # fmt: skip
+    if hollow := [r for r in records if not r["built"]]:
+        axes.plot([r["seconds"] for r in hollow], [100 * r["rmse"] for r in hollow], "o", markerfacecolor="white",
+                  markeredgecolor="#777777", markersize=3.5, zorder=6, label="white: time predicted")  # fmt: skip
+    for r in records:
+        if r["default"]:
+            axes.scatter(r["seconds"], 100 * r["rmse"], s=170, facecolor="none", edgecolor="black", linewidth=1.3,
+                         zorder=5, label="run's default")  # fmt: skip
     labelled(axes, front)
     axes.margins(0.08)
     axes.set(xscale="log", yscale="log", xlabel="seconds", ylabel="relative RMS error, % of the mean light")
@@ -73,9 +80,14 @@ def race(axes: "Axes", records: Sequence[dict[str, Any]]) -> None:
 
 
 def labelled(axes: "Axes", front: Sequence[dict[str, Any]]) -> None:
-    """Nodes x paths below the points of the front."""
+    """Nodes x paths below the points of the front, once for fillers that share them."""
+    last = ""
     for r in front:
-        axes.annotate(f"{r['grid']} x {r['paths']}", (r["seconds"], 100 * r["rmse"]), xytext=(-4, -5), fontsize=7,
+        name = f"{r['grid']} x {r['paths']}"
+        if name == last:
+            continue
+        last = name
+        axes.annotate(name, (r["seconds"], 100 * r["rmse"]), xytext=(-4, -5), fontsize=7,
                       textcoords="offset points", ha="right", va="top", color="#444444", zorder=5)  # fmt: skip
 
 

@@ -85,9 +85,9 @@ def backends(scene: Scene, asked: Queries, budget: float) -> tuple[list[tuple[An
     for plain in _stages("backend"):
         for backend, surface in _surfaces(plain):
             try:
-                for _ in range(2):  # compiled and built in the first
+                for some in (few[:1], few):  # compiled and built in the first
                     begun = time.perf_counter()
-                    backend.solve(scene, few, paths=range(4), bounces=2, seed=0)
+                    backend.solve(scene, some, paths=range(4), bounces=2, seed=0)
             except BadInput as reason:
                 notes.append(f"{backend.name} takes no part: {reason}")
                 continue

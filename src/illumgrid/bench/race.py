@@ -12,13 +12,16 @@ from illumgrid.bench.contestants import COUNTS, Way
 from illumgrid.bench.picture import Studio
 from illumgrid.errors import BadInput
 from illumgrid.grid import GridSpec, IlluminationGrid, read_lattice
+from illumgrid.pilot import corners
 from illumgrid.samples import Queries, Samples, combine, join_samples
 from illumgrid.scene import Scene
 from illumgrid.stages import Interpolator
 from illumgrid.truth import Truth, errors, look_up
 from illumgrid.volume import Floats
 
-PATHS = (4, 16, 64, 256, 1024)
+PATHS = (8, 32, 128, 512, 2048)
+"""Of the rungs of a lane: `run`'s default is one of them."""
+
 SEEDS = 3
 
 
@@ -41,6 +44,10 @@ class Point:
         Megabytes by which the process grew at most, in one run; known on Linux.
     flip : float, optional
         Of a picture at an unseen isovalue.
+    default : bool
+        Whether it is what `run` does when nothing is asked for.
+    built : bool
+        Whether the grid was built; if not, `seconds` are predicted, and only the nodes around the points were lit.
     """
 
     way: Way
@@ -53,6 +60,8 @@ class Point:
     light: list[Floats] = field(default_factory=list)
     memory: float | None = None
     flip: float | None = None
+    default: bool = False
+    built: bool = True
 
     @property
     def label(self) -> str:
@@ -91,6 +100,8 @@ class Run:
 
     def go_on(self, paths: int) -> None:
         """Trace until each query has so many paths."""
+        if paths <= self.paths:
+            return
         begun = time.perf_counter()
         if not self.batches:
             self.batches = [q for q in self.way.sampler.queries(self.scene, self.specs, self.seed) if len(q)]
@@ -137,14 +148,30 @@ def front(points: Iterable[Point], truths: dict[str, Truth]) -> list[Point]:
 
 @dataclass(eq=False)
 class Lane:
-    """A way on one grid: what it has shown so far, and what its next step would cost."""
+    """A way on one grid: what its next step would cost, and the points by which its hopes are judged.
+
+    Those are its own last ones, or before its first step those of the lane that it came from, with a factor on the lag.
+    """
 
     run: Run
     interpolators: tuple[Interpolator, ...]
     rung: int = 0
     cost: float = 0.0
-    lag: float = 1.0
+    hopes: tuple[Point, ...] = ()
+    factor: float = 1.0
     stuck: bool = False
+    first: bool = True
+
+
+def lag(point: Point, error: dict[Point, float]) -> float:
+    """How much less time would do: that of the quickest as good, or what noise takes to become as good as the best.
+
+    Noise halves with four times the paths, hence the square of the error over the least of any no slower.
+    """
+    own = error[point]
+    lead = min(e for p, e in error.items() if p.time <= 1.05 * point.time)
+    quick = min(p.time for p, e in error.items() if e <= 1.05 * own)
+    return float(max(1.0, (own / lead) ** 2, point.time / quick))
 
 
 class Race:
@@ -167,11 +194,38 @@ class Race:
         self.scene, self.truths, self.sizes, self.bounces, self.seed = scene, truths, sizes, bounces, seed
         # Until it has run, a slow backend counts as off the front by its slowness.
         self.lanes = [
-            Lane(Run(scene, way, sizes[0], bounces, seed), way.interpolators, lag=way.slow)
+            Lane(Run(scene, way, sizes[0], bounces, seed), way.interpolators, factor=way.slow)
             for way in sorted(ways, key=lambda way: way.slow)
         ]
         self.points: list[Point] = []
         self.notes: list[str] = []
+
+    def show_default(self, way: Way, grid: int, paths: int) -> None:
+        """Chart what `run` does when nothing is asked for, before all others; its lane goes on from there."""
+        run = Run(self.scene, way, grid, self.bounces, self.seed)
+        run.go_on(paths)
+        interpolator = next(i for i in way.interpolators if i.name == "nearest")
+        point, _ = self._point(run, interpolator)
+        point.default = True
+        self.points.append(point)
+        rung = sum(fewer < paths for fewer in PATHS)
+        if rung < len(PATHS):
+            cost = point.time - run.tracing + run.tracing * (PATHS[rung] / paths - 1)
+            self.lanes.append(Lane(run, way.interpolators, rung, cost, (point,), first=grid in self.sizes))
+
+    def foresee(self, way: Way, grid: int, paths: int, takes: float, default: bool = False) -> None:
+        """Chart a grid of `Direct` by the nodes around the truth's points, which hold what they would in all of it."""
+        around = corners(self.scene, grid, self.truths[way.surface].samples.queries)
+        interpolator = next(i for i in way.interpolators if i.name == "nearest")
+        found = []
+        for k in range(SEEDS):
+            seed = (self.seed + k) % 2**64
+            found.append(around.read(way.backend.solve(
+                self.scene, around.asked, paths=range(paths), bounces=self.bounces, seed=seed
+            )))  # fmt: skip
+        point = Point(way, interpolator, grid, paths, around.nodes, found[0][1], default=default, built=False)
+        point.seconds, point.light = [takes] * len(found), [light for light, _ in found]
+        self.points.append(point)
 
     def step(self, lane: Lane) -> None:
         """Take the next rung of a lane, and fill the grid by every interpolator."""
@@ -179,7 +233,9 @@ class Race:
         begun = time.perf_counter()
         try:
             run.go_on(paths)
-            new = [self._point(run, interpolator)[0] for interpolator in lane.interpolators]
+            same = [p for p in self.points if p.way is run.way and (p.grid, p.paths) == (run.grid, paths)]
+            known = {p.interpolator: p for p in same if p.built}
+            new = [known.get(filler) or self._point(run, filler)[0] for filler in lane.interpolators]
         except BadInput as reason:
             self.notes.append(f"{run.way.label(run.way.interpolators[0])}, {run.grid} nodes: {reason}")
             self.lanes.remove(lane)
@@ -190,34 +246,36 @@ class Race:
                 other.cost = spent * other.run.way.slow / run.way.slow
         truth = self.truths[run.way.surface]
         before = [p for p in self.points if p.way is run.way and p.grid == run.grid and p.paths == PATHS[lane.rung - 1]]
-        self.points += new
-        now = [p.rmse(truth) for p in new]
-        lags = [self._lag(p) for p in new]
-        lane.lag = min(lags)
-        light = run.asking + run.tracing
+        self.points = [p for p in self.points if p.built or p not in same]  # built is better than foreseen
+        self.points += [p for p in new if p.interpolator not in known]
+        now, standing = [p.rmse(truth) for p in new], self._standing()
+        lane.hopes, lane.factor = tuple(new), 1.0
+        light, least = run.asking + run.tracing, self._lag(lane, standing)
         fillers = {p.interpolator: p.seconds[0] - light for p in new}
-        for p, lag in zip(new, lags):  # a slow filler that is also far off holds the others up
-            if fillers[p.interpolator] > 0.5 * light and lag > max(4.0, 2.0 * lane.lag):
+        for p in new:  # a slow filler that is also far off holds the others up
+            if fillers[p.interpolator] > 0.5 * light and lag(p, standing) > max(4.0, 2.0 * least):
                 del fillers[p.interpolator]
         lane.interpolators = tuple(fillers)
         lane.stuck = bool(before) and min(now) > 0.9 * min(p.rmse(truth) for p in before)
         lane.rung += 1
         if lane.rung < len(PATHS):
             lane.cost = run.tracing * (PATHS[lane.rung] / paths - 1) + sum(fillers.values())
-        if lane.rung == 1:
+        if lane.first:
+            lane.first = False
             self._unlock(lane, spent)
 
     def _unlock(self, lane: Lane, spent: float) -> None:
         """What comes after the first rung of a lane: the next finer grid, and on the coarsest more level sets."""
         run = lane.run
-        if finer := [size for size in self.sizes if size > run.grid]:
-            ahead = Run(self.scene, run.way, finer[0], self.bounces, self.seed)
+        finer = [size for size in self.sizes if size > run.grid]
+        if finer and not any(other.run.way is run.way and other.run.grid == finer[0] for other in self.lanes):
             # Twice the nodes may halve the error, for which noise would need four times the paths: so much sooner.
             more = finer[0] / run.grid
-            self.lanes.append(Lane(ahead, lane.interpolators, 0, spent * more**3, lane.lag / more**2))
+            ahead = Run(self.scene, run.way, finer[0], self.bounces, self.seed)
+            self.lanes.append(Lane(ahead, lane.interpolators, 0, spent * more**3, lane.hopes, 1 / more**2))
         if run.way.denser and run.grid == self.sizes[0]:
             ahead = Run(self.scene, run.way.denser, run.grid, self.bounces, self.seed)
-            self.lanes.append(Lane(ahead, lane.interpolators, 0, spent * COUNTS[1] / COUNTS[0], lane.lag))
+            self.lanes.append(Lane(ahead, lane.interpolators, 0, spent * COUNTS[1] / COUNTS[0], lane.hopes))
 
     def _point(self, run: Run, interpolator: Interpolator) -> tuple[Point, list[IlluminationGrid]]:
         grids, seconds = run.fill(interpolator)
@@ -228,16 +286,13 @@ class Race:
         point.light.append(look_up(grids, asked))
         return point, grids
 
-    def _lag(self, point: Point) -> float:
-        """How much less time would do: that of the quickest as good, or what noise takes to become as good as the best.
+    def _standing(self) -> dict[Point, float]:
+        """Errors of all points."""
+        return {p: max(1e-9, p.rmse(self.truths[p.way.surface])) for p in self.points}
 
-        Noise halves with four times the paths, hence the square of the error over the least of any no slower.
-        """
-        error = {id(p): max(1e-9, p.rmse(self.truths[p.way.surface])) for p in self.points}
-        own = error[id(point)]
-        lead = min(error[id(p)] for p in self.points if p.time <= 1.05 * point.time)
-        quick = min(p.time for p in self.points if error[id(p)] <= 1.05 * own)
-        return float(max(1.0, (own / lead) ** 2, point.time / quick))
+    def _lag(self, lane: Lane, standing: dict[Point, float]) -> float:
+        """How much slower than the front a lane is to be expected."""
+        return lane.factor * min((lag(p, standing) for p in lane.hopes), default=1.0)
 
     def next(self, left: float) -> Lane | None:
         """The lane to step: least predicted time, those who lag counted as slower; None if the rest is too costly.
@@ -247,14 +302,15 @@ class Race:
         kept = 1.1 * (SEEDS - 1) * sum(self.front_ladders().values())
         able = [lane for lane in self.lanes if not lane.stuck and lane.rung < len(PATHS)]
         able = [lane for lane in able if kept + SEEDS * lane.cost < left or lane.cost == 0.0]
-        return min(able, key=lambda lane: (lane.cost * lane.lag, lane.run.grid), default=None)
+        standing = self._standing()
+        return min(able, key=lambda lane: (lane.cost * self._lag(lane, standing), lane.run.grid), default=None)
 
     def front_ladders(self) -> dict[tuple[int, int, int], float]:
         """Way, grid and most paths of the front's points that lack seeds, with the seconds of the longest of each."""
         found: dict[tuple[int, int], Point] = {}
         for point in front(self.points, self.truths):
             key = id(point.way), point.grid
-            if len(point.seconds) < SEEDS and (key not in found or found[key].paths < point.paths):
+            if point.built and len(point.seconds) < SEEDS and (key not in found or found[key].paths < point.paths):
                 found[key] = point
         return {(*key, point.paths): point.time for key, point in found.items()}
 
@@ -264,18 +320,19 @@ class Race:
             way, grid, most = min(ladders, key=lambda key: ladders[key])
             if time.perf_counter() + ladders[way, grid, most] > deadline:
                 return
-            same = [p for p in self.points if id(p.way) == way and p.grid == grid and p.paths <= most]
+            same = [p for p in self.points if id(p.way) == way and p.grid == grid and p.paths <= most and p.built]
             fillers = {p.interpolator for p in front(self.points, self.truths)}
             same = [p for p in same if p.interpolator in fillers]
-            seed = self.seed + max(len(p.seconds) for p in same if p.paths == most)
+            again = max(len(p.seconds) for p in same if p.paths == most)
+            seed = (self.seed + again) % 2**64
             run, before = Run(self.scene, same[0].way, grid, self.bounces, seed), resident(reset=True)
             for paths in sorted({p.paths for p in same}):
                 run.go_on(paths)
                 for point in same:
-                    if point.paths == paths and len(point.seconds) == seed - self.seed:
-                        again, grids = self._point(run, point.interpolator)
-                        point.seconds += again.seconds
-                        point.light += again.light
+                    if point.paths == paths and len(point.seconds) == again:
+                        new, grids = self._point(run, point.interpolator)
+                        point.seconds += new.seconds
+                        point.light += new.light
                         point.memory = (resident() or 0.0) - before if before else None
                         if studio and point.flip is None:
                             point.flip = studio.flip(grids)

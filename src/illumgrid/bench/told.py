@@ -48,12 +48,15 @@ def record(point: Point, truths: dict[str, Truth], on_front: bool) -> dict[str, 
         "flip": point.flip,
         "memory_mb": point.memory,
         "front": on_front,
+        "default": point.default,
+        "built": point.built,
     }
 
 
 def table(records: Sequence[dict[str, Any]]) -> str:
-    """The front, and of everybody else the best, as text."""
+    """The front, what `run` does by default, and of everybody else the best, as text."""
     rows = [r for r in records if r["front"]]
+    default = [r for r in records if r["default"] and not r["front"]]
     seen = {r["contestant"] for r in rows}
     rest = sorted((r for r in records if r["contestant"] not in seen), key=lambda r: r["rmse"])
     others = []
@@ -64,12 +67,17 @@ def table(records: Sequence[dict[str, Any]]) -> str:
     wide = max(len(r["contestant"]) for r in records)
     heads = [f"{head:>8}" for head in ("seconds", "error", "+-", "median", "95 %", "bias", "FLIP", "MB")]
     lines = [f"{'contestant':{wide}} {'grid':>5} {'paths':>6} {' '.join(heads)}"]
-    for name, part in (("the front:", sorted(rows, key=lambda r: r["seconds"])), ("the best of the others:", others)):
+    for name, part in (
+        ("the front:", sorted(rows, key=lambda r: r["seconds"])),
+        ("run's default:", default),
+        ("the best of the others:", others),
+    ):
         if part:
             lines.append(name)
         for r in part:
             spread = "" if r["rmse_spread"] is None else f"{r['rmse_spread']:.2%}"
-            setting = f"{r['contestant']:{wide}} {r['grid']:5} {r['paths']:6} {r['seconds']:8.2f}"
+            seconds = f"{'' if r['built'] else '~'}{r['seconds']:.2f}"
+            setting = f"{r['contestant']:{wide}} {r['grid']:5} {r['paths']:6} {seconds:>8}"
             off = f"{r['rmse']:8.2%} {spread:>8} {r['median']:8.2%} {r['p95']:8.2%} {r['bias']:+8.2%}"
             flip = "" if r["flip"] is None else f"{r['flip']:.4f}"
             memory = "" if r["memory_mb"] is None else f"{r['memory_mb']:.0f}"
@@ -95,15 +103,31 @@ def advice(records: Sequence[dict[str, Any]], bars: Sequence[Bar], bounces: int)
         good = [r for r in best if r["rmse"] <= goal]
         if good:
             r = good[0]
-            told.append(f"for {goal:.0%} use {options(r, bounces)} ({r['seconds']:.2g} s, error {r['rmse']:.2%})")
+            told.append(f"for {goal:.0%} use {options(r, bounces)} ({came(r)})")
+    told += [standing(r, best, bounces) for r in records if r["default"]]
     missed = [f"{goal:.0%}" for goal in GOALS if goal < best[-1]["rmse"]]
     if missed:
         r = best[-1]
         told.append(
             f"{' and '.join(missed)} was not reached within this budget; the nearest was {options(r, bounces)} "
-            f"({r['seconds']:.2g} s, error {r['rmse']:.2%}), whose error is mostly {mostly(r, bars)}"
+            f"({came(r)}), whose error is mostly {mostly(r, bars)}"
         )
     return told
+
+
+def came(record: dict[str, Any]) -> str:
+    """Seconds and error of a setting."""
+    seconds = f"{record['seconds']:.0f}" if record["seconds"] >= 10 else f"{record['seconds']:.2g}"
+    return f"{'' if record['built'] else 'about '}{seconds} s, error {record['rmse']:.2%}"
+
+
+def standing(default: dict[str, Any], best: Sequence[dict[str, Any]], bounces: int) -> str:
+    """Where `run`'s default stands against the front (from fast to accurate)."""
+    own = f"run's default ({came(default)})"
+    if default["front"]:
+        return f"{own} is on the front"
+    better = min((r for r in best if r["seconds"] <= default["seconds"]), key=lambda r: r["rmse"])
+    return f"{own} is beaten by {options(better, bounces)} ({came(better)})"
 
 
 def mostly(record: dict[str, Any], bars: Sequence[Bar]) -> str:

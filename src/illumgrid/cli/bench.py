@@ -41,7 +41,8 @@ def bench(
     with heard():
         scene = given.make(smooth or 0.0)
         with told_progress() as progress:
-            found = benches.bench(scene, budget, seed, progress)
+            preset = (given.preset.grid, given.preset.paths) if given.preset else None
+            found = benches.bench(scene, budget, seed, progress, preset)
         files, told = report.files(found, given.name, scene)
     store.write_folder(folder, iter(files.items()))
     typer.echo(told)
