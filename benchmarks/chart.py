@@ -1,7 +1,7 @@
 """Speed and accuracy in figures: ``python benchmarks/chart.py [PART...] [--volumes DIR] [--json FILE] [--quick]``.
 
 promises
-    `--error` and `--seconds` on five fields of 48³ voxels, against a truth on level sets: is what was asked kept?
+    `--error` and `--seconds` on six scenes of 48³ voxels, against a truth on level sets: is what was asked kept?
 ways
     `direct` with `nearest` against every other sampler and interpolator, each at its best setting, at equal error.
 goals
@@ -9,12 +9,12 @@ goals
 pays
     After how many isovalues has the grid paid for itself against path tracing each isosurface anew at equal error?
 volumes
-    `bench` on real volumes (charts as PNG beside the JSON file), and where `run`'s defaults lie against the front.
+    `bench` on real volumes (charts as PNG beside the JSON file), and where `run`'s default lies against the front.
 
 defaults
     The default nodes and paths of `run` beside others, `direct` and `nearest`, on real volumes.
 
-All with a white sky, albedo 0.8, 6 bounces unless chosen by the pilot, and the backend numba. Real volumes are looked
+All with a white sky (but for the box), albedo 0.8, 6 bounces unless chosen by the pilot, and the backend numba. Real volumes are looked
 for in DIR, by default ../shared/volumes from the repository's root, and passed over where they are not.
 """
 
@@ -63,6 +63,7 @@ def fields():
         "labyrinth": Scene.sky(labyrinth(), range=(-0.4, 0.4)),
         "colored": Scene.sky(gaussians(48, seed=5), (0.4, 0.6, 0.9), range=(0.3, 1.2)),
         "on a floor": Scene.floor(gaussians(48, count=15, seed=9), range=(0.2, 0.8)),
+        "in the box with a lamp": Scene.box(gaussians(48, count=15, seed=9), range=(0.2, 0.8)),
     }
 
 
@@ -97,7 +98,7 @@ def promises(asked):
                 )  # fmt: skip
                 chosen = f"grid {plan['grid']}, {plan['paths']} paths, met {plan['met']}"
                 came = f"{reached:7.2%} in {seconds:6.1f} s, ratio {ratio:5.2f}"
-                print(f"  {name:18} {option} {value:<5} {came}, {chosen}")
+                print(f"  {name:22} {option} {value:<5} {came}, {chosen}", flush=True)
     error = [f["ratio"] for f in found if "error" in f and f["plan"]["met"]]
     seconds = [f["ratio"] for f in found if "seconds" in f and f["plan"]["met"]]
     print(f"  errors within 1.3: {np.mean(np.array(error) <= 1.3):.0%} of {len(error)}; "
@@ -206,18 +207,24 @@ def volumes(asked):
         if not (asked.volumes / name).exists():
             continue
         scene = Scene.sky(read_volume(asked.volumes / name), range=limits)
-        result = bench(scene, 40 if asked.quick else 60)
+        result = bench(scene, 40 if asked.quick else 80)
         content, said = report.files(result, name.split(".")[0], scene)
         (asked.json.parent / f"chart-{name.split('.')[0]}.png").write_bytes(content["chart.png"])
-        light, took = timed(scene)
         exact = result.truths["levelset"]
-        rmse = off(light, exact).rmse
+        default = next(p for p in result.points if p.default)
+        took, rmse = default.time, default.rmse(exact)
         beaten = [p for p in result.front if p.time < took and p.rmse(exact) < rmse]
         advice = said.splitlines()[-1]
-        found[name] = {"default": {"seconds": took, "rmse": rmse, "beaten": len(beaten)}, "advice": advice}
+        found[name] = {
+            "default": {"seconds": took, "built": default.built, "rmse": rmse, "beaten": len(beaten)},
+            "truth": exact.error, "least": min(p.rmse(exact) for p in result.points), "advice": advice,
+        }  # fmt: skip
         better = [f"{p.label} {p.grid} x {p.paths} ({p.time:.1f} s, {p.rmse(exact):.2%})" for p in beaten]
-        print(f"  {name:20} default {took:6.1f} s {rmse:7.2%}; beaten by {', '.join(better) or 'nobody'}")
-        print(f"    {advice}")
+        least = found[name]["least"]
+        print(f"  {name:20} default {'' if default.built else '~'}{took:.1f} s {rmse:7.2%}; beaten by "
+              f"{', '.join(better) or 'nobody'}; truth {exact.error:.2%}, {least / exact.error:.1f} of the least error",
+              flush=True)  # fmt: skip
+        print(f"    {advice}", flush=True)
     return found
 
 

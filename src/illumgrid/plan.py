@@ -17,6 +17,7 @@ from illumgrid.volume import smooth
 SHARE = 0.25  # of the asked error that the bounces left out may be
 JUDGED = 0.95  # of the asked seconds: the rest is for the judgement at the end
 PATHS = 16  # from each node, with which grids are tried
+TRUTH = 4  # what its paths take, over others: they are walked twice, with more bounces and with fewer
 MOST_NODES = 40_000_000  # a grid of about 2 GB with all that belongs to it
 
 
@@ -159,28 +160,40 @@ def planned(
     begun = time.perf_counter()
     walls = sum(len(queries) for queries in wall_queries(scene, levels))
     candidates = [grid] if grid else sizes(scene)
-    pace = timed(scene, backend, candidates[len(candidates) // 2], 32, 4, seed)
-    goal, left, points = 0.02 if error is None else error, np.inf, 384
-    if seconds is not None:  # the first look takes a tenth of the time
+    closed = not scene.background.any()  # light lives long there
+    pace = timed(scene, backend, candidates[len(candidates) // 2], 32, 12 if closed else 4, seed, 1 << 14)
+    goal, left, points, most = 0.02 if error is None else error, np.inf, 384, 1024
+    first = candidates
+    if seconds is not None:  # the first look takes a tenth of the time, and its truth half of that
         left = JUDGED * seconds
-        points = int(np.clip(0.1 * left / pace.path / (2 * 8 * PATHS * len(candidates)), 96, 384))
-    pilot = Pilot.start(scene, backend, points, goal, seed)
+        each = 2 * 8 * PATHS * pace.path
+        if each * len(candidates) * 96 > 0.1 * left:
+            first = candidates[::2]
+        points = int(np.clip(0.1 * left / (each * len(first)), 64, 384))
+        most = int(np.clip(0.05 * left / (TRUTH * pace.path * points), 64, most))
+    pilot = Pilot.start(scene, backend, points, goal, seed, most)
     followed = pilot.bounces_for(SHARE * goal) if bounces is None else bounces
-    tried = _ladder(pilot, candidates, followed, pace, error, left)
+    tried = _ladder(pilot, first, followed, pace, error, left)
     choice = choose(tried, pace, walls, error, left, paths)
     # For an error every finer grid, in turn: the choice may have been so good by chance.
     near = [size for size in candidates if 0.6 < size / choice.measured.grid < (1.7 if error is None else np.inf)]
     # A closer look around it, at more points: for a sixth of the time that the run will take, or with time to spare.
-    more = int(min(8192.0, choice.seconds / 6 / pace.path / (2 * 8 * PATHS * 3)))
+    more = int(min(8192.0, choice.seconds / 6 / pace.path / (2 * 8 * PATHS * len(near[:3]) + TRUTH * 128)))
     if seconds is None:
         more = max(more, 4096)
+    elif time.perf_counter() - begun > 0.35 * left:  # the first look was slow: what is left is for the run
+        more = 0
     if more > 1.5 * points:
         goal = choice.error if error is None else error
+        if seconds is not None and bounces is None:  # by the few points of the first look: more would take too long
+            followed = pilot.bounces_for(SHARE * goal)
         # More points tell more than a sharper truth at each: its variance is subtracted.
         pilot = Pilot.start(scene, backend, more, goal, seed + 1, 128)
-        followed = pilot.bounces_for(SHARE * goal) if bounces is None else bounces
+        if seconds is None and bounces is None:
+            followed = pilot.bounces_for(SHARE * goal)
         tried = _ladder(pilot, near, followed, pace, error, left)
-    pace = timed(scene, backend, choice.measured.grid, choice.paths, followed, seed)
+    about = 1 << 16 if seconds is None else int(np.clip(0.02 * left / pace.path, 1 << 12, 1 << 16))
+    pace = timed(scene, backend, choice.measured.grid, choice.paths, followed, seed, about)
     choice = choose(tried, pace, walls, error, left - (time.perf_counter() - begun), paths)
     return Plan(
         choice.measured.grid, choice.paths, followed, choice.error, choice.seconds,
