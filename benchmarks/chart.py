@@ -14,8 +14,9 @@ volumes
 defaults
     The default nodes and paths of `run` beside others, `direct` and `nearest`, on real volumes.
 
-All with a white sky (but for the box), albedo 0.8, 6 bounces unless chosen by the pilot, and the backend numba. Real volumes are looked
-for in DIR, by default ../shared/volumes from the repository's root, and passed over where they are not.
+All with a white sky (but for the box), albedo 0.8, 6 bounces unless chosen by the pilot, and the backend numba. Real
+volumes are looked for in DIR, by default ../shared/volumes from the repository's root, and passed over where they are
+not.
 """
 
 import argparse
@@ -213,13 +214,15 @@ def volumes(asked):
         exact = result.truths["levelset"]
         default = next(p for p in result.points if p.default)
         took, rmse = default.time, default.rmse(exact)
-        beaten = [p for p in result.front if p.time < took and p.rmse(exact) < rmse]
+        error = {p: p.rmse(result.truths[p.way.surface]) for p in result.points}
+        beaten = [p for p in result.front if p.time < took and error[p] < rmse]
         advice = said.splitlines()[-1]
         found[name] = {
             "default": {"seconds": took, "built": default.built, "rmse": rmse, "beaten": len(beaten)},
-            "truth": exact.error, "least": min(p.rmse(exact) for p in result.points), "advice": advice,
+            "truth": exact.error, "least": min(e for p, e in error.items() if p.way.surface == "levelset"),
+            "advice": advice,
         }  # fmt: skip
-        better = [f"{p.label} {p.grid} x {p.paths} ({p.time:.1f} s, {p.rmse(exact):.2%})" for p in beaten]
+        better = [f"{p.label} {p.grid} x {p.paths} ({p.time:.1f} s, {error[p]:.2%})" for p in beaten]
         least = found[name]["least"]
         print(f"  {name:20} default {'' if default.built else '~'}{took:.1f} s {rmse:7.2%}; beaten by "
               f"{', '.join(better) or 'nobody'}; truth {exact.error:.2%}, {least / exact.error:.1f} of the least error",

@@ -224,21 +224,25 @@ def _least_time(work: Callable[[], object]) -> float:
     return min(spent)
 
 
+def _in_rows(nodes: NDArray[np.int64], count: int, random: np.random.Generator) -> NDArray[np.int64]:
+    """About `count` of the nodes, or all, in runs of 64."""
+    starts = random.integers(0, max(1, len(nodes) - 63), max(1, min(len(nodes), count) // 64))
+    return np.asarray(nodes[np.unique((starts[:, None] + np.arange(64)).clip(0, len(nodes) - 1))])
+
+
 def timed(scene: Scene, backend: Backend, grid: int, paths: int, bounces: int, seed: int, about: int = 1 << 16) -> Pace:
     """Time the machine on nodes that lie as they do in a run: in rows, next to one another."""
     random = np.random.default_rng((seed, 3))
     per_path, per_node = [], []
     for number, spec in enumerate(specs_of(scene, grid)):
         nodes = reachable(scene.fields[number], spec)
-        take = min(len(nodes), max(256, about // paths))
-        runs = random.integers(0, max(1, len(nodes) - 63), max(1, take // 64))
-        chosen = nodes[np.unique((runs[:, None] + np.arange(64)).clip(0, len(nodes) - 1))]
+        chosen, many = (_in_rows(nodes, count, random) for count in (max(256, about // paths), 1 << 13))
         asked = at_nodes(scene, number, spec, chosen)
         small = GridSpec.over(scene.fields[number].volume, 24)
         begun = time.perf_counter()
         answer = backend.solve(scene, asked, paths=range(paths), bounces=bounces, seed=seed)
         per_path.append((time.perf_counter() - begun) / (len(chosen) * paths))
-        asking = _least_time(partial(at_nodes, scene, number, spec, chosen))
+        asking = _least_time(partial(at_nodes, scene, number, spec, many))  # few would cost as much
         filling = _least_time(partial(Nearest().fill, answer, small, number))
-        per_node.append(asking / len(chosen) + filling / int(np.prod(small.shape)))
+        per_node.append(asking / len(many) + filling / int(np.prod(small.shape)))
     return Pace(float(np.mean(per_node)), float(np.mean(per_path)))
