@@ -1,7 +1,7 @@
 """Speed and accuracy in figures: ``python benchmarks/chart.py [PART...] [--volumes DIR] [--json FILE] [--quick]``.
 
 promises
-    `--error` and `--seconds` on six scenes of 48³ voxels, against a truth on level sets: is what was asked kept?
+    `--error` and `--seconds` on five fields of 48³ voxels, against a truth on level sets: is what was asked kept?
 ways
     `direct` with `nearest` against every other sampler and interpolator, each at its best setting, at equal error.
 goals
@@ -14,9 +14,8 @@ volumes
 defaults
     The default nodes and paths of `run` beside others, `direct` and `nearest`, on real volumes.
 
-All with a white sky (but for the box), albedo 0.8, 6 bounces unless chosen by the pilot, and the backend numba. Real
-volumes are looked for in DIR, by default ../shared/volumes from the repository's root, and passed over where they are
-not.
+All with a white sky, albedo 0.8, 6 bounces unless chosen by the pilot, and the backend numba. Real volumes are looked
+for in DIR, by default ../shared/volumes from the repository's root, and passed over where they are not.
 """
 
 import argparse
@@ -64,7 +63,6 @@ def fields():
         "labyrinth": Scene.sky(labyrinth(), range=(-0.4, 0.4)),
         "colored": Scene.sky(gaussians(48, seed=5), (0.4, 0.6, 0.9), range=(0.3, 1.2)),
         "on a floor": Scene.floor(gaussians(48, count=15, seed=9), range=(0.2, 0.8)),
-        "in the box with a lamp": Scene.box(gaussians(48, count=15, seed=9), range=(0.2, 0.8)),
     }
 
 
