@@ -115,7 +115,7 @@ def parts(axes: "Axes", bars: Sequence[Bar]) -> None:
     ]
     axes.errorbar(place, total, yerr=reach, fmt="_", markersize=15, color="black", elinewidth=1, capsize=2,
                   label="all of it, as judged by the truth")  # fmt: skip
-    axes.set_ylim(0, 1.15 * max([*base, *total, 1e-9]))
+    axes.set_ylim(0, 1.25 * max([*base, *(t + up for t, up in zip(total, reach[1])), 1e-9]))
     axes.set_xticks(place, ticks, fontsize=8)
     for grid in sorted({bar.grid for bar in bars}):
         own = [x for x, bar in zip(place, bars) if bar.grid == grid]
@@ -124,7 +124,7 @@ def parts(axes: "Axes", bars: Sequence[Bar]) -> None:
     axes.set_xlabel("paths, and nodes along the longest axis", labelpad=20)
     axes.set_ylabel("relative RMS error, %")
     axes.set_title("Where the error of direct + nearest comes from", fontsize=10)
-    axes.legend(fontsize=8)
+    axes.legend(fontsize=8, ncols=2, loc="upper center")
 
 
 def image(figure: "Figure", kind: str) -> bytes:

@@ -192,10 +192,11 @@ class Race:
         self, scene: Scene, truths: dict[str, Truth], ways: list[Way], sizes: list[int], bounces: int, seed: int
     ) -> None:
         self.scene, self.truths, self.sizes, self.bounces, self.seed = scene, truths, sizes, bounces, seed
-        # Until it has run, a slow backend counts as off the front by its slowness.
+        # Until it has run, a slow backend counts as off the front by its slowness. The first lane tells what the others
+        # will cost: one that builds no meshes.
         self.lanes = [
             Lane(Run(scene, way, sizes[0], bounces, seed), way.interpolators, factor=way.slow)
-            for way in sorted(ways, key=lambda way: way.slow)
+            for way in sorted(ways, key=lambda way: (way.surface != "levelset", way.slow))
         ]
         self.points: list[Point] = []
         self.notes: list[str] = []
