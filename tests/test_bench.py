@@ -15,6 +15,7 @@ from illumgrid.bench.contestants import COUNTS, Way, ways
 from illumgrid.bench.race import Point, Race, Run, covered, front
 from illumgrid.bench.whence import Bar
 from illumgrid.interpolators.nearest import Nearest
+from illumgrid.pilot import Pace
 from illumgrid.samplers.direct import Direct
 from illumgrid.samplers.uniform import Uniform
 from illumgrid.samples import Samples
@@ -208,7 +209,7 @@ def test_run_says_what_would_help_noisy_data(call, tmp_path):
 def test_what_is_foreseen_of_a_grid_is_what_the_grid_will_hold(truth):
     scene, exact = truth
     race = Race(scene, {"levelset": exact}, [WAY], [9, 21], 3, 5)
-    race.foresee(WAY, 21, 8, 12.5, default=True)
+    race.foresee(WAY, Nearest(), 21, 8, 12.5, default=True)
     (seen,) = race.points
     assert seen.default and not seen.built and seen.seconds == [12.5] * 3 and seen.paths == 8
     asked = exact.samples.queries
@@ -229,7 +230,7 @@ def test_what_is_foreseen_of_a_grid_is_what_the_grid_will_hold(truth):
 def test_runs_default_is_charted_first_and_goes_on(truth):
     scene, exact = truth
     race = Race(scene, {"levelset": exact}, [WAY], [5, 11], 3, 0)
-    race.show_default(WAY, 11, 64)
+    race.show_default(WAY, Nearest(), 11, 64)
     (default,) = race.points
     assert default.default and default.built and default.paths == 64
     while lane := race.next(np.inf):
@@ -253,11 +254,19 @@ def test_it_is_told_where_runs_default_stands(truth):
     assert "run's default (about 15 s, error 20.00%) is on the front" in told.advice(records, BARS, 5)
 
 
-def test_a_default_that_is_too_costly_is_foreseen_and_so_are_its_neighbours(truth):
+def test_a_default_that_is_too_costly_is_foreseen_and_so_are_its_neighbours(truth, monkeypatch):
     scene, exact = truth
     race = Race(scene, {"levelset": exact}, [WAY], [5, 11, 22], 3, 0)
     said = _show_default(race, 11, 32, 1e-6)
     assert "~" in said[0] and [(p.grid, p.paths, p.built) for p in race.points] == [(11, 32, False)]
+    with monkeypatch.context() as patch:  # a second a path: there is time for three seeds of 8 paths, not of 32
+        patch.setattr("illumgrid.bench.timed", lambda *_: Pace(0.0, 1.0))
+        race = Race(scene, {"levelset": exact}, [WAY], [5, 11, 22], 3, 0)
+        _show_default(race, 22, 32, (3 * 8 * 8 * len(exact) + 1000) / 0.15)
+    assert {(p.grid, p.paths, p.default) for p in race.points} == {(22, 32, True), (11, 8, False), (22, 8, False)}
+    assert not any(p.built for p in race.points)
+    shown = {(p.grid, p.paths): p for p in race.points}
+    assert shown[22, 32].time == 4 * shown[22, 8].time == 32 * shown[22, 8].queries
     race = Race(scene, {"levelset": exact}, [WAY], [5, 11, 22], 3, 0)
     assert not _show_default(race, 11, 32, 1e6)
     assert [(p.grid, p.paths, p.built) for p in race.points] == [(11, 32, True)]

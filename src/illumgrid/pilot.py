@@ -6,7 +6,7 @@ points: that measures the error of a grid without building it.
 """
 
 import time
-from collections.abc import Callable
+import timeit
 from dataclasses import dataclass
 from functools import partial
 
@@ -214,16 +214,6 @@ class Pilot:
         return self.backend.solve(self.scene, asked, paths=paths, bounces=bounces, seed=seed)
 
 
-def _least_time(work: Callable[[], object]) -> float:
-    """Seconds of the quickest of three calls: they are so short that a stall of the machine would count for many."""
-    spent = []
-    for _ in range(3):
-        begun = time.perf_counter()
-        work()
-        spent.append(time.perf_counter() - begun)
-    return min(spent)
-
-
 def _in_rows(nodes: NDArray[np.int64], count: int, random: np.random.Generator) -> NDArray[np.int64]:
     """About `count` of the nodes, or all, in runs of 64."""
     starts = random.integers(0, max(1, len(nodes) - 63), max(1, min(len(nodes), count) // 64))
@@ -242,7 +232,8 @@ def timed(scene: Scene, backend: Backend, grid: int, paths: int, bounces: int, s
         begun = time.perf_counter()
         answer = backend.solve(scene, asked, paths=range(paths), bounces=bounces, seed=seed)
         per_path.append((time.perf_counter() - begun) / (len(chosen) * paths))
-        asking = _least_time(partial(at_nodes, scene, number, spec, many))  # few would cost as much
-        filling = _least_time(partial(Nearest().fill, answer, small, number))
-        per_node.append(asking / len(many) + filling / int(np.prod(small.shape)))
+        # Few nodes would cost as much as many; and the least of three, for in so short a time a stall counts for many.
+        asking = timeit.repeat(partial(at_nodes, scene, number, spec, many), number=1, repeat=3)
+        filling = timeit.repeat(partial(Nearest().fill, answer, small, number), number=1, repeat=3)
+        per_node.append(min(asking) / len(many) + min(filling) / int(np.prod(small.shape)))
     return Pace(float(np.mean(per_node)), float(np.mean(per_path)))

@@ -205,24 +205,26 @@ def _show_default(race: Race, grid: int, paths: int, budget: float) -> list[str]
     own = registry.backend("auto")
     entrants = [lane.run.way for lane in race.lanes if lane.run.way.surface == "levelset"]
     way = next((w for w in entrants if w.sampler == Direct() and w.backend.name == own.name), None)
-    if way is None:
+    nearest = next((i for i in way.interpolators if i.name == "nearest"), None) if way else None
+    if way is None or nearest is None:
         return []
     begun, pace = time.perf_counter(), timed(race.scene, own, grid, 16, race.bounces, race.seed)
 
-    def takes(size: int, count: int) -> float:
-        specs = zip(race.scene.fields, specs_of(race.scene, size))
-        return pace.seconds(sum(len(reachable(field, spec)) for field, spec in specs), count)
+    def nodes(size: int) -> int:
+        return sum(len(reachable(f, spec)) for f, spec in zip(race.scene.fields, specs_of(race.scene, size)))
 
-    if takes(grid, paths) <= DEFAULT * budget:
-        race.show_default(way, grid, paths)
+    takes = pace.seconds(nodes(grid), paths)
+    if takes <= DEFAULT * budget:
+        race.show_default(way, nearest, grid, paths)
         return []
-    race.foresee(way, grid, paths, takes(grid, paths), default=True)
-    more = [(takes(size, count), size, count) for size in race.sizes[1:] for count in (8, 32, 128)]
+    race.foresee(way, nearest, grid, paths, takes, default=True)
+    lit = {size: nodes(size) for size in race.sizes[1:]}
+    more = [(pace.seconds(lit[size], count), size, count) for size in lit for count in (8, 32, 128)]
     for seconds, size, count in sorted(more):
         # As many nodes as those of the default, and as many seeds.
         will = SEEDS * count * pace.path * 8 * len(race.truths["levelset"])
         if (size, count) != (grid, paths) and time.perf_counter() - begun + will < FORESEEN * budget:
-            race.foresee(way, size, count, seconds)
+            race.foresee(way, nearest, size, count, seconds)
     return ["with ~ is what would take too much of the budget: its seconds are predicted, and of its nodes only those "
             "around the points of the truth were lit"]  # fmt: skip
 

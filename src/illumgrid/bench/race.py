@@ -12,7 +12,7 @@ from illumgrid.bench.contestants import COUNTS, Way
 from illumgrid.bench.picture import Studio
 from illumgrid.errors import BadInput
 from illumgrid.grid import GridSpec, IlluminationGrid, read_lattice
-from illumgrid.pilot import corners
+from illumgrid.pilot import corners, specs_of
 from illumgrid.samples import Queries, Samples, combine, join_samples
 from illumgrid.scene import Scene
 from illumgrid.stages import Interpolator
@@ -96,7 +96,7 @@ class Run:
     @property
     def specs(self) -> list[GridSpec]:
         """Lattices, one a field."""
-        return [GridSpec.over(f.volume, self.grid) for f in self.scene.fields]
+        return specs_of(self.scene, self.grid)
 
     def go_on(self, paths: int) -> None:
         """Trace until each query has so many paths."""
@@ -201,12 +201,11 @@ class Race:
         self.points: list[Point] = []
         self.notes: list[str] = []
 
-    def show_default(self, way: Way, grid: int, paths: int) -> None:
+    def show_default(self, way: Way, nearest: Interpolator, grid: int, paths: int) -> None:
         """Chart what `run` does when nothing is asked for, before all others; its lane goes on from there."""
         run = Run(self.scene, way, grid, self.bounces, self.seed)
         run.go_on(paths)
-        interpolator = next(i for i in way.interpolators if i.name == "nearest")
-        point, _ = self._point(run, interpolator)
+        point, _ = self._point(run, nearest)
         point.default = True
         self.points.append(point)
         rung = sum(fewer < paths for fewer in PATHS)
@@ -214,17 +213,18 @@ class Race:
             cost = point.time - run.tracing + run.tracing * (PATHS[rung] / paths - 1)
             self.lanes.append(Lane(run, way.interpolators, rung, cost, (point,), first=grid in self.sizes))
 
-    def foresee(self, way: Way, grid: int, paths: int, takes: float, default: bool = False) -> None:
+    def foresee(
+        self, way: Way, nearest: Interpolator, grid: int, paths: int, takes: float, default: bool = False
+    ) -> None:
         """Chart a grid of `Direct` by the nodes around the truth's points, which hold what they would in all of it."""
         around = corners(self.scene, grid, self.truths[way.surface].samples.queries)
-        interpolator = next(i for i in way.interpolators if i.name == "nearest")
         found = []
         for k in range(SEEDS):
             seed = (self.seed + k) % 2**64
             found.append(around.read(way.backend.solve(
                 self.scene, around.asked, paths=range(paths), bounces=self.bounces, seed=seed
             )))  # fmt: skip
-        point = Point(way, interpolator, grid, paths, around.nodes, found[0][1], default=default, built=False)
+        point = Point(way, nearest, grid, paths, around.nodes, found[0][1], default=default, built=False)
         point.seconds, point.light = [takes] * len(found), [light for light, _ in found]
         self.points.append(point)
 
