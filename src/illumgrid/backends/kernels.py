@@ -76,10 +76,8 @@ BETWEEN = _between(0) + _between(1) + _between(2)
 @inlined
 def first_cell(u, d, last):
     """Cell along one axis that a ray enters at index coordinate u; outside 0 .. last - 1 it has left the field."""
-    cell = int(u)
-    if u == cell and (d < 0.0 or (d == 0.0 and cell == last)):
-        cell -= 1
-    return cell
+    cell = int(u)  # without branches: on a voxel the sign of d is a coin toss
+    return cell - int((u == cell) & ((d < 0.0) | ((d == 0.0) & (cell == last))))
 
 
 @inlined

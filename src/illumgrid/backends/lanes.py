@@ -25,7 +25,7 @@ WIDE = 8
 
 
 def cached(*sources: ModuleType, **options: Any) -> Callable[[Any], Any]:
-    """Compile a function into a disk cache that sees edits in other modules too.
+    """Compile a function into a disk cache that sees edits in other modules, and another Numba, too.
 
     Parameters
     ----------
@@ -41,10 +41,13 @@ def cached(*sources: ModuleType, **options: Any) -> Callable[[Any], Any]:
     """
     # Numba takes compiled code from the disk if the file that holds the function is still the same: by its contents
     # (0.68), by its time and size (0.61). What else went into the code is not asked, so an upgrade that changes only
-    # another file would run the old code. But the cache's files are named after the function's qualified name: with a
-    # digest in there, what other sources gave is not found. This holds wherever the cache lies and whatever times an
-    # installer sets, and leaves NUMBA_CACHE_DIR and the caches of other packages alone.
-    digest = hashlib.sha256("".join(map(inspect.getsource, sources)).encode()).hexdigest()[:16]
+    # another file would run the old code. And where two processes find the code of another version of Numba, one writes
+    # its index anew before it has replaced the code, and the other loads what it cannot read. But the cache's files are
+    # named after the function's qualified name: with a digest in there, what others made is not found. This holds
+    # wherever the cache lies and whatever times an installer sets, and leaves NUMBA_CACHE_DIR and the caches of other
+    # packages alone.
+    made_of = [numba.__version__, *map(inspect.getsource, sources)]
+    digest = hashlib.sha256("\n".join(made_of).encode()).hexdigest()[:16]
 
     def compiled(function: Any) -> Any:
         function.__qualname__ += f"_{digest}"
