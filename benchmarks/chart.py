@@ -23,6 +23,7 @@ import json
 import os
 import time
 import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -34,7 +35,7 @@ from illumgrid.bench.contestants import ways as every_way
 from illumgrid.bench.race import SEEDS, Race, front
 from illumgrid.plan import planned
 from illumgrid.scene import level_table
-from illumgrid.truth import Truth, begin, converge, errors, look_up, unseen_on_level_sets
+from illumgrid.truth import begin, converge, errors, look_up, unseen_on_level_sets
 from illumgrid.volume import smooth
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -72,7 +73,7 @@ def truth_of(scene, error=0.002, levels=40, points=8000, bounces=32, paths=4096)
 
 
 def off(light, truth):
-    return errors(look_up(light.grids, truth.samples.queries), truth)
+    return errors(look_up(light.grids, truth.queries), truth)
 
 
 def timed(scene, **options):
@@ -108,9 +109,9 @@ def promises(asked):
 def race_of(scene, budget):
     """All points of a race with a fixed number of bounces, and its truth."""
     truth = truth_of(scene, 0.004, levels=24, points=2400, bounces=BOUNCES)
-    entrants, _ = every_way(scene, truth.samples.queries, budget)
+    entrants, _ = every_way(scene, truth.queries, budget)
     entrants = [way for way in entrants if way.backend.name == "numba" and way.surface == "levelset"]
-    race = Race(scene, {"levelset": Truth(truth.samples, BOUNCES)}, entrants, sizes(scene), BOUNCES, 0)
+    race = Race(scene, {"levelset": replace(truth, bounces=BOUNCES)}, entrants, sizes(scene), BOUNCES, 0)
     begun = time.perf_counter()
     # `bench` keeps time back to run each lane with more seeds, which is not done here.
     while lane := race.next(SEEDS * (budget - (time.perf_counter() - begun))):

@@ -18,7 +18,6 @@ from illumgrid.interpolators.nearest import Nearest
 from illumgrid.pilot import Pace
 from illumgrid.samplers.direct import Direct
 from illumgrid.samplers.uniform import Uniform
-from illumgrid.samples import Samples
 from illumgrid.scene import Scene
 from illumgrid.split import Split
 from illumgrid.truth import Truth, begin, errors, unseen_on_level_sets
@@ -99,19 +98,19 @@ def test_covered_points_read_only_nodes_with_light(truth):
     run = Run(scene, WAY, 9, 1, 0)
     run.go_on(4)
     (grid,), _ = run.fill(Nearest())
-    asked = exact.samples.queries
+    asked = exact.queries
     assert covered([replace(grid, support=np.ones_like(grid.support))], asked).all()
     assert not covered([replace(grid, support=np.zeros_like(grid.support))], asked).any()
 
 
 def test_everything_that_is_registered_takes_part_or_is_told(truth):
     scene, exact = truth
-    entrants, notes = ways(scene, exact.samples.queries, 1e6)
+    entrants, notes = ways(scene, exact.queries, 1e6)
     names = {(w.sampler.name, w.backend.name) for w in entrants}
     assert {("direct", "numba"), ("uniform", "numba"), ("direct", "reference")} <= names
     chain = next(w for w in entrants if w.sampler.name == "uniform")
     assert chain.sampler.count == COUNTS[0] and chain.denser.sampler.count == COUNTS[1]
-    few, notes = ways(scene, exact.samples.queries, 1e-6)
+    few, notes = ways(scene, exact.queries, 1e-6)
     assert {w.backend.name for w in few} == {"numba"}  # the fastest is never too slow
     assert any("reference takes no part: 64 queries" in note for note in notes)
 
@@ -134,8 +133,8 @@ def test_the_advice_names_the_fastest_that_is_good_enough_and_what_is_missing(tr
 
 def test_remarks_tell_a_blunt_truth_and_missing_seeds(truth):
     _, exact = truth
-    samples = exact.samples
-    blunt = Truth(Samples(samples.queries, samples.mean, samples.m2 + 1000, samples.paths), 8)
+    one, other = exact.halves
+    blunt = Truth((one, replace(other, mean=other.mean + 1)), 8)
     said = _remarks((point(blunt, 1, 0.01, seeds=1),), {"levelset": blunt})
     assert "more than a fifth" in said[0] and "fewer than 3 seeds" in said[1]
     assert not _remarks((point(exact, 1, 0.5),), {"levelset": exact})
@@ -212,7 +211,7 @@ def test_what_is_foreseen_of_a_grid_is_what_the_grid_will_hold(truth):
     race.foresee(WAY, Nearest(), 21, 8, 12.5, default=True)
     (seen,) = race.points
     assert seen.default and not seen.built and seen.seconds == [12.5] * 3 and seen.paths == 8
-    asked = exact.samples.queries
+    asked = exact.queries
     for seed, light in zip((5, 6, 7), seen.light):
         run = Run(scene, WAY, 21, 3, seed)
         run.go_on(8)
@@ -275,7 +274,7 @@ def test_a_default_that_is_too_costly_is_foreseen_and_so_are_its_neighbours(trut
 def test_points_are_given_up_for_a_sharper_truth_where_light_is_rough(truth):
     _, exact = truth
     assert len(_thinned(exact, "levelset", 1.0, 1e9, 0)) == len(exact)
-    many = Truth(exact.samples[np.arange(2000) % len(exact)], 8)
+    many = exact[np.arange(2000) % len(exact)]
     few = _thinned(many, "mesh", 1.0, 0.6 * (exact.error / 0.01) ** 2, 0)
     assert few.surface == "mesh" and abs(len(few) - 1200) <= 1
     assert len(_thinned(many, "mesh", 1.0, 1e-9, 0)) == 500

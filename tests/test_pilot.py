@@ -49,7 +49,7 @@ FIELDS = {
 
 
 def off(light, scene, truth):
-    return errors(look_up(light.grids, truth.samples.queries), truth).rmse
+    return errors(look_up(light.grids, truth.queries), truth).rmse
 
 
 @pytest.fixture(scope="module")
@@ -99,14 +99,15 @@ def test_the_split_finds_parts_that_were_put_in():
     scene = sky()
     asked = Queries.at(scene, np.zeros((n, 3)))
     exact = 2.0 + 0.3 * random.normal(size=(n, 1)) * np.ones((1, 3))
-    paths, own = 64, 0.02  # the truth is itself noisy
-    noise = own * random.normal(size=(n, 3))
-    m2 = np.full((n, 3), own**2 * paths * (paths - 1), np.float32)
+    noise = 0.03 * random.normal(size=(2, n, 3))  # the truth is itself noisy
 
-    def samples(mean):
-        return Samples(asked, mean.astype(np.float32), m2, np.full(n, paths, np.int32))
+    def truth_of(light, bounces):
+        none, paths = np.zeros((n, 3), np.float32), np.full(n, 32, np.int32)
+        one, other = (Samples(asked, (light + off).astype(np.float32), none, paths) for off in noise)
+        return Truth((one, other), bounces)
 
-    truth, fewer = Truth(samples(exact + noise), 9), samples(exact - 0.06 + noise)
+    truth, fewer = truth_of(exact, 9), truth_of(exact - 0.06, 2)
+    assert truth.error == pytest.approx(0.03 / np.sqrt(2) / truth.mean, rel=0.02)
     grid = 0.1 * random.normal(size=(n, 1))
     covered = np.arange(n) % 4 > 0
     grid[~covered] *= 3
@@ -125,7 +126,7 @@ def test_the_measured_noise_is_that_of_two_built_grids():
     pilot = Pilot.start(scene, BACKEND, 1500, 0.05, 0)
     found = pilot.measure(nodes, pilot.fewer(3), 3, 16)
     one, other = (
-        look_up(run(scene, grid=nodes, paths=16, bounces=3, seed=s).grids, pilot.truth.samples.queries) for s in (8, 9)
+        look_up(run(scene, grid=nodes, paths=16, bounces=3, seed=s).grids, pilot.truth.queries) for s in (8, 9)
     )
     built = ((one - other) ** 2).mean() / 2 / pilot.truth.mean**2
     assert found.split.noise == pytest.approx(built, rel=0.25)
@@ -244,7 +245,17 @@ def test_an_asked_error_is_met_nine_times_in_ten(truths):
 def test_the_judgement_agrees_with_a_truth(truths):
     scene, truth = truths["labyrinth"]
     light = run(scene, grid=14, paths=16, seed=0)
-    assert judge(scene, BACKEND, light.grids, 0, 10**9) == pytest.approx(off(light, scene, truth), rel=0.2)
+    assert judge(scene, BACKEND, light.grids, 0, 10**7, 16, 4) == pytest.approx(off(light, scene, truth), rel=0.2)
+
+
+def test_judgements_are_right_on_average_where_light_comes_by_few_paths():
+    scene = Scene.box(bumps(20, 12, 3, (0.12, 0.25)), range=(0.2, 0.8))
+    light = run(scene, grid=20, paths=128, bounces=8, seed=0)
+    asked = unseen_in_volume(scene, 2000, 50)
+    truth = converge(begin(scene, BACKEND, asked, 32, 50), scene, BACKEND, 50, 0.02, 256)
+    queries = light.recipe["queries"]
+    found = [judge(scene, BACKEND, light.grids, seed, queries, 128, 8) for seed in range(12)]
+    assert np.mean(found) == pytest.approx(off(light, scene, truth), rel=0.12)
 
 
 def test_run_tells_what_it_chose_and_what_it_reached():
@@ -274,7 +285,7 @@ def test_errors_of_a_known_difference():
     asked = unseen_in_volume(scene, 50, 0)
     n = len(asked)
     rgb = np.ones((n, 3), np.float32)
-    truth = Truth(Samples(asked, 2 * rgb, 0 * rgb, np.full(n, 9, np.int32)), 1)
+    truth = Truth((Samples(asked, 2 * rgb, 0 * rgb, np.full(n, 9, np.int32)),) * 2, 1)
     flat = IlluminationGrid(grid.spec, np.full_like(grid.values, 2.2), grid.error, grid.support)
     found = errors(look_up([flat], asked), truth)
     for value in (found.rmse, found.median, found.p95, found.bias):

@@ -247,7 +247,7 @@ def run(
             )
     reached = None
     if plan is not None:
-        reached = judge(scene, chosen[1], baked.grids, seed, baked.queries * baked.paths * (bounces + 1))
+        reached = judge(scene, chosen[1], baked.grids, seed, baked.queries, baked.paths, bounces)
     recipe = {
         **{kind: _described(stage) for kind, stage in zip(("sampler", "backend", "interpolator"), chosen)},
         "grid": max(max(spec.shape) for spec in specs),

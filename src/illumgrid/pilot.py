@@ -7,7 +7,7 @@ points: that measures the error of a grid without building it.
 
 import time
 import timeit
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -122,9 +122,11 @@ class Measured:
 
     def paths_for(self, squared: float) -> int | None:
         """Fewest paths that are predicted to reach a mean squared error; None if none do."""
-        if squared <= self.floor:
-            return None
-        needed = self.paths * (self.split.noise / (squared - self.floor)) ** (1 / self.falls)
+        return self.paths_within(squared - self.floor) if squared > self.floor else None
+
+    def paths_within(self, noise: float) -> int:
+        """Fewest paths whose noise is predicted to have at most this mean square."""
+        needed = self.paths * (self.split.noise / noise) ** (1 / self.falls)
         return min(MOST, max(FEWEST, 2 * int(np.ceil(needed / 2))))
 
 
@@ -175,20 +177,20 @@ class Pilot:
         first = begin(scene, backend, asked, enough(scene, backend, 0.1 * error, seed), seed)
         if not len(first) or not first.mean > 0:
             raise BadInput("no light reaches the surfaces of this scene; expected a background or a lamp that does")
-        few = Truth(first.samples[:: max(1, len(first) // 512)], first.bounces)
+        few = first[:: max(1, len(first) // 512)]
         return cls(scene, backend, seed, converge(first, scene, backend, seed, error, most), few)
 
-    def fewer(self, bounces: int) -> Samples:
+    def fewer(self, bounces: int) -> Truth:
         """The light at the points with fewer bounces, by the same paths."""
-        truth = self.truth.samples
-        few = min(bounces, self.truth.bounces)
-        return trace(self.scene, self.backend, truth.queries, range(int(truth.paths[0])), few, self.seed)
+        return self._again(self.truth, min(bounces, self.truth.bounces))
+
+    def _again(self, truth: Truth, bounces: int) -> Truth:
+        light = trace(self.scene, self.backend, truth.queries, range(truth.paths), bounces, self.seed)
+        return replace(truth, halves=light, bounces=bounces)
 
     def left_out(self, bounces: int) -> float:
         """Root mean square of the light that more bounces would add, relative."""
-        asked = self.few.samples.queries
-        light = trace(self.scene, self.backend, asked, range(int(self.few.samples.paths[0])), bounces, self.seed)
-        return float(np.sqrt((missing(light, self.few) ** 2).mean()))
+        return float(np.sqrt((missing(self._again(self.few, bounces), self.few) ** 2).mean()))
 
     def bounces_for(self, tolerance: float) -> int:
         """Fewest bounces that leave out less than a `tolerance`."""
@@ -197,9 +199,9 @@ class Pilot:
                 return min(bounces, self.truth.bounces)
         return self.truth.bounces
 
-    def measure(self, grid: int, fewer: Samples, bounces: int, paths: int) -> Measured:
+    def measure(self, grid: int, fewer: Truth, bounces: int, paths: int) -> Measured:
         """What a grid of this size is off, with `paths` paths from two seeds each."""
-        around = corners(self.scene, grid, self.truth.samples.queries)
+        around = corners(self.scene, grid, self.truth.queries)
         seeds = self.seed, (self.seed + 2**62) % 2**64
         start = [self._light(around.asked, range(paths // 4), bounces, seed) for seed in seeds]
         rest = [self._light(around.asked, range(paths // 4, paths), bounces, seed) for seed in seeds]

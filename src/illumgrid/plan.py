@@ -11,7 +11,7 @@ from illumgrid.grid import IlluminationGrid
 from illumgrid.pilot import FEWEST, MOST, Measured, Pace, Pilot, specs_of, timed
 from illumgrid.scene import Levels, Scene
 from illumgrid.stages import Backend
-from illumgrid.truth import begin, converge, enough, errors, look_up, unseen_in_volume
+from illumgrid.truth import begin, enough, errors, look_up, unseen_in_volume
 from illumgrid.volume import smooth
 
 SHARE = 0.25  # of the asked error that the bounces left out may be
@@ -110,8 +110,9 @@ def _ladder(
             break
         if error is not None:
             choice = choose(found, pace, 0, error, np.inf, None)
-            if choice.met and pace.seconds(now.nodes, FEWEST) >= choice.seconds:
-                break  # a finer grid takes longer than what will do
+            # A finer grid has twice the nodes or more, and needs the paths that the noise alone asks for.
+            if choice.met and pace.seconds(2 * now.nodes, now.paths_within(error**2)) >= choice.seconds:
+                break
     return found
 
 
@@ -217,21 +218,21 @@ def rounds(plan: Plan, until: float, clock: Callable[[], float] = time.perf_coun
         more = 2 * int((until - after - now) * done / (now - begun) / 2)
 
 
-def judge(scene: Scene, backend: Backend, grids: Sequence[IlluminationGrid], seed: int, work: int) -> float:
+def judge(
+    scene: Scene, backend: Backend, grids: Sequence[IlluminationGrid], seed: int, queries: int, paths: int, bounces: int
+) -> float:
     """Relative RMS error of grids at points that neither they nor the pilot asked for, the truth's own subtracted.
 
-    Many points with few paths, for where the light is rough a few points carry the error; up to a twentieth of the
-    `work`, the reflections that the run followed, or what 512 points take.
+    For a twentieth of the run's work, or what 1024 points take: as many paths as the grids had, which makes the truth
+    as sharp as they are, and the more points, for where the light is rough a few of them carry the error. How many is
+    settled beforehand: who goes on until the truth is sharper than what he found stops where chance made that large.
     """
-    bounces = enough(scene, backend, 1e-3, seed)
-    points, paths = int(np.clip(work / (20 * 16 * (bounces + 1)), 512, 4096)), 16
-    truth = begin(scene, backend, unseen_in_volume(scene, points, seed + 2), bounces, seed + 2, paths)
-    while True:
-        found = errors(look_up(grids, truth.samples.queries), truth).rmse
-        paths *= 2
-        if truth.error <= found or 20 * points * paths * (bounces + 1) > work:
-            return found
-        truth = converge(truth, scene, backend, seed + 2, 0.0, paths)
+    followed = enough(scene, backend, 1e-3, seed)
+    work = queries * paths * (bounces + 1) / (20 * (followed + 1))
+    points = int(np.clip(work / paths, 1024, 4096))
+    many = 2 ** round(np.log2(np.clip(work / points, 32, max(32, paths))))
+    truth = begin(scene, backend, unseen_in_volume(scene, points, seed + 2), followed, seed + 2, many)
+    return errors(look_up(grids, truth.queries), truth).rmse
 
 
 def helps(scene: Scene, backend: Backend, grid: int, bounces: int, seed: int) -> dict[str, float]:

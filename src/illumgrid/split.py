@@ -5,7 +5,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from illumgrid.samples import Samples
 from illumgrid.truth import Truth
 from illumgrid.volume import Floats
 
@@ -44,12 +43,12 @@ class Split:
         return max(0.0, self.noise + self.grid + self.uncovered + self.bounces + self.cross)
 
 
-def missing(fewer: Samples, truth: Truth) -> Floats:
+def missing(fewer: Truth, truth: Truth) -> Floats:
     """Light (n, 3), relative, that the bounces beyond those of `fewer` add; the truth walks the same paths further."""
-    return (truth.light - fewer.mean) / truth.mean
+    return (truth.light - fewer.light) / truth.mean
 
 
-def split(one: Floats, other: Floats, covered: NDArray[np.bool_], fewer: Samples, truth: Truth) -> Split:
+def split(one: Floats, other: Floats, covered: NDArray[np.bool_], fewer: Truth, truth: Truth) -> Split:
     """Split the error of a grid.
 
     Parameters
@@ -58,15 +57,15 @@ def split(one: Floats, other: Floats, covered: NDArray[np.bool_], fewer: Samples
         What two grids that differ in nothing but their seeds hold at the points of the truth.
     covered : (n,) bool
         Points whose nodes all have light of their own.
-    fewer : Samples
+    fewer : Truth
         The light at those points by the paths of the truth, cut off after as many bounces as the grids had.
     truth : Truth
     """
-    light = fewer.mean.astype(float)
+    light = fewer.light
     first, second = (one - light) / truth.mean, (other - light) / truth.mean
     more = missing(fewer, truth)
     # The paths that stand for the truth here are in both errors: their own variance is subtracted.
-    own = np.square(fewer.stderr, dtype=float).mean(axis=1) / truth.mean**2
+    own = (fewer.off**2).mean(axis=1) / truth.mean**2
     both = (first * second).mean(axis=1) - own
     return Split(
         noise=float(((first - second) ** 2).mean()) / 2,

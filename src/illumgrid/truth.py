@@ -1,7 +1,8 @@
 """Converged light at points that nobody asked for, and how far a grid is from it."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -24,11 +25,13 @@ def apart(seed: int) -> int:
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """Light at unseen points, with its own error.
+    """Light at unseen points, with its own error: two halves from independent seeds tell it by how they differ.
+
+    The error bars of the samples do not: they are made to cover, and where light comes by few paths that is more.
 
     Parameters
     ----------
-    samples : Samples
+    halves : (Samples, Samples)
         Answers from many paths; no holes.
     bounces : int
         Reflections that were followed.
@@ -36,31 +39,53 @@ class Truth:
         The stand-in for the level sets that the light met: "levelset" (trilinear) or "mesh" (marching cubes).
     """
 
-    samples: Samples
+    halves: tuple[Samples, Samples]
     bounces: int
     surface: str = "levelset"
 
     def __len__(self) -> int:
-        return len(self.samples)
+        return len(self.halves[0])
+
+    def __getitem__(self, rows: Any) -> "Truth":
+        """Some of the points, by a slice, numbers or a mask."""
+        one, other = self.halves
+        return replace(self, halves=(one[rows], other[rows]))
+
+    @property
+    def queries(self) -> Queries:
+        """The points."""
+        return self.halves[0].queries
+
+    @property
+    def paths(self) -> int:
+        """Paths from each point, of both halves."""
+        return 2 * int(self.halves[0].paths[0]) if len(self) else 0
 
     @property
     def light(self) -> Floats:
         """Irradiance (n, 3)."""
-        return self.samples.mean.astype(float)
+        one, other = self.halves
+        return (one.mean.astype(float) + other.mean) / 2
+
+    @property
+    def off(self) -> Floats:
+        """By how much (n, 3) either half is off their mean: its square has the variance of that for its expectation."""
+        one, other = self.halves
+        return (one.mean.astype(float) - other.mean) / 2
 
     @property
     def mean(self) -> float:
         """Mean irradiance over points and colours, to which errors are relative."""
-        return float(self.samples.mean.mean(dtype=float))
+        return float(self.light.mean())
 
     @property
     def variance(self) -> float:
-        """Mean squared standard error of the truth itself."""
-        return float(np.square(self.samples.stderr, dtype=float).mean())
+        """Mean squared error of the truth itself."""
+        return float((self.off**2).mean())
 
     @property
     def error(self) -> float:
-        """Root mean square standard error of the truth itself, relative to the mean irradiance."""
+        """Root mean square error of the truth itself, relative to the mean irradiance."""
         return float(np.sqrt(self.variance)) / self.mean
 
 
@@ -142,22 +167,32 @@ def enough(scene: Scene, backend: Backend, tolerance: float, seed: int) -> int:
     return bounces
 
 
-def trace(scene: Scene, backend: Backend, asked: Queries, paths: range, bounces: int, seed: int) -> Samples:
-    """Answers with paths that no run of this seed walks; holes (points inside another field's solid) stay in."""
-    return backend.solve(scene, asked, paths=paths, bounces=bounces, seed=apart(seed))
+def trace(
+    scene: Scene, backend: Backend, asked: Queries, paths: range, bounces: int, seed: int
+) -> tuple[Samples, Samples]:
+    """Answers from two seeds, by paths that no run of `seed` walks; holes (points inside another solid) stay in.
+
+    Each seed walks half of the paths, whose limits are even.
+    """
+    half = range(paths.start // 2, paths.stop // 2)
+    one, other = (
+        backend.solve(scene, asked, paths=half, bounces=bounces, seed=(apart(seed) + k * 2**61) % 2**64) for k in (0, 1)
+    )
+    return one, other
 
 
 def begin(scene: Scene, backend: Backend, asked: Queries, bounces: int, seed: int, paths: int = 64) -> Truth:
     """Trace a few paths from each point; points inside another field's solid are left out."""
-    samples = trace(scene, backend, asked, range(paths), bounces, seed)
-    return Truth(samples[samples.paths > 0], bounces)
+    found = Truth(trace(scene, backend, asked, range(paths), bounces, seed), bounces)
+    return found[found.halves[0].paths > 0]
 
 
 def converge(truth: Truth, scene: Scene, backend: Backend, seed: int, error: float, paths: int = 1 << 14) -> Truth:
     """Go on until the truth's own relative error is at most `error`, or `paths` paths from each point are spent."""
-    while len(truth) and truth.error > error and (done := int(truth.samples.paths[0])) < paths:
-        more = trace(scene, backend, truth.samples.queries, range(done, 2 * done), truth.bounces, seed)
-        truth = Truth(combine(truth.samples, more), truth.bounces)
+    while len(truth) and truth.error > error and truth.paths < paths:
+        more = trace(scene, backend, truth.queries, range(truth.paths, 2 * truth.paths), truth.bounces, seed)
+        one, other = (combine(before, after) for before, after in zip(truth.halves, more))
+        truth = replace(truth, halves=(one, other))
     return truth
 
 

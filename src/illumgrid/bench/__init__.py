@@ -1,7 +1,7 @@
 """The speed-accuracy chart: seconds against error, for everything that is registered, on the user's own data."""
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -90,7 +90,7 @@ def _thinned(truth: Truth, surface: str, spent: float, left: float, seed: int) -
     takes = spent * (truth.error / GOAL) ** 2
     keep = int(np.clip(len(truth) * left / max(takes, 1e-9), min(FEWEST, len(truth)), len(truth)))
     chosen = np.sort(np.random.default_rng((seed, 4)).permutation(len(truth))[:keep])
-    return Truth(truth.samples[chosen], truth.bounces, surface)
+    return replace(truth[chosen], surface=surface)
 
 
 def _grown(
@@ -101,16 +101,11 @@ def _grown(
     for rest, (surface, truth) in zip(range(len(truths), 0, -1), list(truths.items())):
         spent, begun = 0.0, time.perf_counter()
         until = begun + (end - begun) / rest
-        while (
-            truth.error > error[surface]
-            and time.perf_counter() + 2 * spent < until
-            and truth.samples.paths[0] < 1 << 15
-        ):
+        while truth.error > error[surface] and time.perf_counter() + 2 * spent < until and truth.paths < 1 << 15:
             step = time.perf_counter()
-            paths = 2 * int(truth.samples.paths[0])
-            truth = converge(truth, scene, tracers[surface], seed, 0.0, paths)
+            truth = converge(truth, scene, tracers[surface], seed, 0.0, 2 * truth.paths)
             spent = time.perf_counter() - step
-        truths[surface] = Truth(truth.samples, truth.bounces, surface)
+        truths[surface] = truth
 
 
 def bench(

@@ -74,7 +74,7 @@ class Studio:
         height = min(240, height // 12 * 12)
         if height < 48 or importlib.util.find_spec("flip_evaluator") is None:
             return None
-        albedo = np.array([field.material.albedo for field in scene.fields])[truth.samples.queries.target]
+        albedo = np.array([field.material.albedo for field in scene.fields])[truth.queries.target]
         exposure = tone.automatic_exposure((truth.light * albedo / np.pi).astype(np.float32))
         row = scene.levels(SHARE)[0]
         grids = [Traced(scene, backend, n, row, truth.bounces, seed) for n in range(len(scene.fields))]

@@ -217,7 +217,7 @@ class Race:
         self, way: Way, nearest: Interpolator, grid: int, paths: int, takes: float, default: bool = False
     ) -> None:
         """Chart a grid of `Direct` by the nodes around the truth's points, which hold what they would in all of it."""
-        around = corners(self.scene, grid, self.truths[way.surface].samples.queries)
+        around = corners(self.scene, grid, self.truths[way.surface].queries)
         found = []
         for k in range(SEEDS):
             seed = (self.seed + k) % 2**64
@@ -280,7 +280,7 @@ class Race:
 
     def _point(self, run: Run, interpolator: Interpolator) -> tuple[Point, list[IlluminationGrid]]:
         grids, seconds = run.fill(interpolator)
-        asked = self.truths[run.way.surface].samples.queries
+        asked = self.truths[run.way.surface].queries
         queries = sum(len(a) for a in run.answers)
         point = Point(run.way, interpolator, run.grid, run.paths, queries, covered(grids, asked))
         point.seconds.append(seconds)

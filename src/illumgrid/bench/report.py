@@ -53,8 +53,8 @@ def _described(
         "truth": {
             surface: {
                 "points": len(truth),
-                "isovalues": len(set(truth.samples.queries.level[:, 0].tolist())),
-                "paths": int(truth.samples.paths[0]),
+                "isovalues": len(set(truth.queries.level[:, 0].tolist())),
+                "paths": truth.paths,
                 "bounces": truth.bounces,
                 "mean": truth.mean,
                 "error": truth.error,

@@ -235,8 +235,8 @@ def _judged(light: "Illumination", backend: Any, seed: int) -> "Illumination":
 
     if light.recipe.get("reached") or backend.geometry == "mesh":
         return light
-    work = light.recipe["queries"] * light.recipe["paths"] * (light.recipe["bounces"] + 1)
-    found = judge(light.scene, registry.backend("auto"), light.grids, seed, work)
+    done = [light.recipe[of] for of in ("queries", "paths", "bounces")]
+    found = judge(light.scene, registry.backend("auto"), light.grids, seed, *done)
     return replace(light, recipe={**light.recipe, "reached": found})
 
 
