@@ -1,7 +1,7 @@
 """Speed and accuracy in figures: ``python benchmarks/chart.py [PART...] [--volumes DIR] [--json FILE] [--quick]``.
 
 promises
-    `--error` and `--seconds` on five fields of 48³ voxels, against a truth on level sets: is what was asked kept?
+    `--error` and `--seconds` on six scenes of 48³ voxels, against a truth on level sets: is what was asked kept?
 ways
     `direct` with `nearest` against every other sampler and interpolator, each at its best setting, at equal error.
 goals
@@ -64,6 +64,7 @@ def fields():
         "labyrinth": Scene.sky(labyrinth(), range=(-0.4, 0.4)),
         "colored": Scene.sky(gaussians(48, seed=5), (0.4, 0.6, 0.9), range=(0.3, 1.2)),
         "on a floor": Scene.floor(gaussians(48, count=15, seed=9), range=(0.2, 0.8)),
+        "in the box": Scene.box(gaussians(48), range=(0.2, 0.9)),
     }
 
 
@@ -86,8 +87,12 @@ def promises(asked):
     """Ratios of what came to what was asked."""
     found = []
     for name, scene in fields().items():
-        truth = truth_of(scene, 0.003)
-        for option, values in (("error", (0.05, 0.02, 0.01)), ("seconds", (5, 15) if asked.quick else (5, 20, 60))):
+        rough = name == "in the box"  # where errors are larger and a path takes five times longer
+        truth = truth_of(scene, 0.02 if rough else 0.003, paths=1024 if rough else 4096)
+        for option, values in (
+            ("error", (0.1, 0.05) if rough else (0.05, 0.02, 0.01)),
+            ("seconds", (5, 15) if asked.quick else (5, 20, 60)),
+        ):
             for value in values:
                 light, seconds = timed(scene, **{option: value}, isovalues=4, seed=3)
                 reached, plan = off(light, truth).rmse, light.recipe["plan"]
@@ -97,7 +102,7 @@ def promises(asked):
                      "judged": light.recipe["reached"]}
                 )  # fmt: skip
                 chosen = f"grid {plan['grid']}, {plan['paths']} paths, met {plan['met']}"
-                came = f"{reached:7.2%} in {seconds:6.1f} s, ratio {ratio:5.2f}"
+                came = f"{reached:7.2%} (judged {light.recipe['reached']:6.2%}) in {seconds:6.1f} s, ratio {ratio:5.2f}"
                 print(f"  {name:22} {option} {value:<5} {came}, {chosen}", flush=True)
     error = [f["ratio"] for f in found if "error" in f and f["plan"]["met"]]
     seconds = [f["ratio"] for f in found if "seconds" in f and f["plan"]["met"]]

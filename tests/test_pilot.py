@@ -76,6 +76,17 @@ def test_unseen_points_lie_on_level_sets_of_the_range_evenly_in_isovalue_and_in_
         assert np.abs(np.histogram(height, 5, (-1, 1))[0] / len(asked) - 0.2).max() < 0.03
 
 
+def test_small_level_sets_have_as_many_points_as_large_ones():
+    def needle(x):
+        return np.exp(-((10 * x**2).sum(axis=1) ** 0.5))
+
+    scene = sky(sampled(needle, (48, 48, 48), (-1, -1, -1), np.full(3, 2 / 47)), (0.001, 0.8))
+    asked = unseen_in_volume(scene, 1000, 0)
+    assert 950 < len(asked) <= 1000
+    share = (asked.level[:, 0] - 0.001) / 0.799
+    assert np.abs(np.histogram(share, 5, (0, 1))[0] - 200).max() < 30
+
+
 def test_unseen_points_differ_from_seed_to_seed_and_the_truth_walks_other_paths():
     scene = sky()
     one, other = (unseen_in_volume(scene, 100, seed).point for seed in (0, 1))

@@ -5,12 +5,12 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from illumgrid.bake import light_left_out
 from illumgrid.grid import IlluminationGrid
-from illumgrid.samplers.direct import crossed_cells
 from illumgrid.samples import Queries, Samples, combine, join_queries
-from illumgrid.scene import Scene
+from illumgrid.scene import Field, Scene
 from illumgrid.stages import Backend, on_level_sets
 from illumgrid.volume import Floats, cell_gradient, index_to_world, interpolate
 
@@ -134,16 +134,17 @@ def unseen_in_volume(scene: Scene, points: int, seed: int) -> Queries:
     found = []
     for number, field in enumerate(scene.fields):
         random = np.random.default_rng((apart(seed), 2, number))
-        crossed = crossed_cells(field)
-        cells = np.flatnonzero(crossed)
+        cells, chance = _cells_by_step(field)
         if not len(cells):
             continue
-        tried = random.choice(cells, max(1 << 15, 64 * points))
-        index = np.stack(np.unravel_index(tried, crossed.shape), axis=1) + random.random((len(tried), 3))
+        upto = np.cumsum(chance)
+        tried = np.searchsorted(upto, random.random(max(1 << 15, 64 * points)) * upto[-1]).clip(0, len(cells) - 1)
+        shape = tuple(n - 1 for n in field.volume.shape)
+        index = np.stack(np.unravel_index(cells[tried], shape), axis=1) + random.random((len(tried), 3))
         share = (interpolate(field.volume, index) - field.range[0]) / (field.range[1] - field.range[0])
         kept = (share >= 0) & (share <= 1)
         index, step = index[kept], np.minimum(share[kept] * _STEPS, _STEPS - 1).astype(int)
-        weight = np.linalg.norm(cell_gradient(field.volume, index), axis=1)
+        weight = np.linalg.norm(cell_gradient(field.volume, index), axis=1) / chance[tried[kept]]
         total = np.bincount(step, weight, minlength=_STEPS)
         weight = weight / np.where(total > 0, total, 1.0)[step]
         if weight.any():
@@ -157,6 +158,26 @@ def unseen_in_volume(scene: Scene, points: int, seed: int) -> Queries:
         return Queries.at(scene, np.zeros((0, 3)))
     asked = join_queries(found)
     return asked[np.flatnonzero(asked.normal.any(axis=1))]
+
+
+def _cells_by_step(field: Field) -> tuple[NDArray[np.int64], Floats]:
+    """Flat numbers (n,) of the voxel cells that the range crosses, and chances (n,) that give every step as many.
+
+    Chosen all alike, the few cells around a small level set would hardly be met.
+    """
+    low = high = np.clip(
+        np.floor((field.volume.values - field.range[0]) / (field.range[1] - field.range[0]) * _STEPS), -1, _STEPS
+    ).astype(np.int8)
+    for axis in range(3):
+        line, other = np.moveaxis(low, axis, 0), np.moveaxis(high, axis, 0)
+        low = np.moveaxis(np.minimum(line[:-1], line[1:]), 0, axis)
+        high = np.moveaxis(np.maximum(other[:-1], other[1:]), 0, axis)
+    first, last = np.maximum(low, 0).reshape(-1), np.minimum(high, _STEPS - 1).reshape(-1)
+    cells = np.flatnonzero(first <= last)
+    first, last = first[cells], last[cells].astype(int) + 1
+    many = np.cumsum(np.bincount(first, minlength=_STEPS + 1) - np.bincount(last, minlength=_STEPS + 1))
+    rare = np.concatenate([[0.0], np.cumsum(1.0 / np.maximum(many, 1))])
+    return cells, rare[last] - rare[first]
 
 
 def enough(scene: Scene, backend: Backend, tolerance: float, seed: int) -> int:
