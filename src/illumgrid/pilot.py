@@ -231,6 +231,7 @@ def timed(scene: Scene, backend: Backend, grid: int, paths: int, bounces: int, s
         chosen, many = (_in_rows(nodes, count, random) for count in (max(256, about // paths), 1 << 13))
         asked = at_nodes(scene, number, spec, chosen)
         small = GridSpec.over(scene.fields[number].volume, 24)
+        backend.solve(scene, asked[:1], paths=range(2), bounces=bounces, seed=seed)  # loads what is compiled
         begun = time.perf_counter()
         answer = backend.solve(scene, asked, paths=range(paths), bounces=bounces, seed=seed)
         per_path.append((time.perf_counter() - begun) / (len(chosen) * paths))

@@ -18,6 +18,7 @@ SHARE = 0.25  # of the asked error that the bounces left out may be
 JUDGED = 0.95  # of the asked seconds: the rest is for the judgement at the end
 PATHS = 16  # from each node, with which grids are tried
 TRUTH = 4  # what its paths take, over others: they are walked twice, with more bounces and with fewer
+SOON = 5.0  # seconds that a look at more points may take even before a shorter run
 MOST_NODES = 40_000_000  # a grid of about 2 GB with all that belongs to it
 
 
@@ -179,20 +180,25 @@ def planned(
     # For an error every finer grid, in turn: the choice may have been so good by chance.
     near = [size for size in candidates if 0.6 < size / choice.measured.grid < (1.7 if error is None else np.inf)]
     # A closer look around it, at more points: for a sixth of the time that the run will take, or with time to spare.
-    more = int(min(8192.0, choice.seconds / 6 / pace.path / (2 * 8 * PATHS * len(near[:3]) + TRUTH * 128)))
-    if seconds is None:
-        more = max(more, 4096)
+    look = pace.path * (2 * 8 * PATHS * len(near[:3]) + TRUTH * 128)  # seconds a point
+    more = int(min(8192.0, choice.seconds / 6 / look))
+    if error is not None:
+        more = 4096
     elif time.perf_counter() - begun > 0.35 * left:  # the first look was slow: what is left is for the run
         more = 0
-    if more > 1.5 * points:
-        goal = choice.error if error is None else error
-        if seconds is not None and bounces is None:  # by the few points of the first look: more would take too long
+    while more > 1.5 * points:
+        points, goal = more, choice.error if error is None else error
+        if error is None and bounces is None:  # by the few points of the first look: more would take too long
             followed = pilot.bounces_for(SHARE * goal)
         # More points tell more than a sharper truth at each: its variance is subtracted.
-        pilot = Pilot.start(scene, backend, more, goal, seed + 1, 128)
-        if seconds is None and bounces is None:
+        pilot = Pilot.start(scene, backend, points, goal, seed + 1, 128)
+        if error is not None and bounces is None:
             followed = pilot.bounces_for(SHARE * goal)
         tried = _ladder(pilot, near, followed, pace, error, left)
+        choice, more = choose(tried, pace, walls, error, left, paths), 0
+        if error is not None and choice.measured.split.uncertain > 0.1 * error**2:
+            # A few points carry the error, as where the field is noisy: many more are needed to tell it.
+            more = int(min(4 * points, 16384, max(SOON, choice.seconds) / look))
     about = 1 << 16 if seconds is None else int(np.clip(0.02 * left / pace.path, 1 << 12, 1 << 16))
     pace = timed(scene, backend, choice.measured.grid, choice.paths, followed, seed, about)
     choice = choose(tried, pace, walls, error, left - (time.perf_counter() - begun), paths)
