@@ -35,7 +35,7 @@ from illumgrid.bench.contestants import ways as every_way
 from illumgrid.bench.race import SEEDS, Race, front
 from illumgrid.plan import planned
 from illumgrid.scene import level_table
-from illumgrid.truth import begin, converge, errors, look_up, unseen_on_level_sets
+from illumgrid.truth import begin, converge, errors, look_up, trace, unseen_on_level_sets
 from illumgrid.volume import smooth
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -189,11 +189,10 @@ def pays(asked):
             level = float(scene.levels(t)[0, 0])
             vertices = isosurface(scene.fields[0].volume, level).vertices  # which both ways need
             begun = time.perf_counter()
-            few = backend("numba").solve(
-                scene, Queries.at(scene, vertices, level=level), paths=range(16), bounces=BOUNCES, seed=0
-            )
-            tracing = time.perf_counter() - begun
-            noise = np.sqrt((few.stderr[few.paths > 0].astype(float) ** 2).mean()) / few.mean.mean()
+            points = Queries.at(scene, vertices, level=level)
+            one, other = trace(scene, backend("numba"), points, range(32), BOUNCES, 0)
+            tracing = (time.perf_counter() - begun) / 2
+            noise = np.sqrt(((one.mean - other.mean)[one.paths > 0] ** 2).mean() / 2) / one.mean.mean()
             each.append(tracing * max(1.0, 16 * (noise / 0.03) ** 2) / 16)  # paths that make the noise equal
             begun = time.perf_counter()
             light.grids[0].lookup(vertices)

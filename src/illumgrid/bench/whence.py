@@ -4,12 +4,16 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from illumgrid.pilot import Pilot
 from illumgrid.scene import Scene
 from illumgrid.split import Split
 from illumgrid.stages import Backend
 
 PATHS = (16, 64, 256)
+FEWEST, MOST = 512, 4096  # points
+TRUTH = 256  # paths, at most
 
 
 @dataclass(frozen=True)
@@ -22,11 +26,16 @@ class Bar:
 
 
 def bars(
-    scene: Scene, backend: Backend, sizes: Sequence[int], bounces: int, seed: int, seconds: float, points: int = 512
+    scene: Scene, backend: Backend, sizes: Sequence[int], bounces: int, seed: int, seconds: float, path: float
 ) -> list[Bar]:
-    """Measure the parts on grids of these sizes, cheapest first, as far as the time goes."""
+    """Measure the parts on grids of these sizes, cheapest first, as far as the time goes, of which a path takes `path`.
+
+    At as many points as half of the time allows: where a few of them carry the error, few points miss those.
+    """
     begun = time.perf_counter()
-    pilot = Pilot.start(scene, backend, points, 0.004, seed + 1, 256)
+    each = path * (2 * 8 * sum(PATHS) * len(sizes) + 2 * TRUTH)
+    points = int(np.clip(seconds / 2 / each, FEWEST, MOST))
+    pilot = Pilot.start(scene, backend, points, 0.004, seed + 1, TRUTH)
     fewer = pilot.fewer(bounces)
     found: list[Bar] = []
     last = 0.0
