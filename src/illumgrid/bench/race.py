@@ -36,6 +36,8 @@ class Point:
     grid, paths, queries : int
     seconds : list of float
         One a seed: sampler, backend and interpolator.
+    filling : float
+        Of those of the first seed, what the interpolator took.
     light : list of (n, 3) float64
         One a seed: what the grids hold at the points of the truth.
     covered : (n,) bool
@@ -57,6 +59,7 @@ class Point:
     queries: int
     covered: NDArray[np.bool_]
     seconds: list[float] = field(default_factory=list)
+    filling: float = 0.0
     light: list[Floats] = field(default_factory=list)
     memory: float | None = None
     flip: float | None = None
@@ -252,7 +255,7 @@ class Race:
         now, standing = [p.rmse(truth) for p in new], self._standing()
         lane.hopes, lane.factor = tuple(new), 1.0
         light, least = run.asking + run.tracing, self._lag(lane, standing)
-        fillers = {p.interpolator: p.seconds[0] - light for p in new}
+        fillers = {p.interpolator: p.filling for p in new}
         for p in new:  # a slow filler that is also far off holds the others up
             if fillers[p.interpolator] > 0.5 * light and lag(p, standing) > max(4.0, 2.0 * least):
                 del fillers[p.interpolator]
@@ -284,6 +287,7 @@ class Race:
         queries = sum(len(a) for a in run.answers)
         point = Point(run.way, interpolator, run.grid, run.paths, queries, covered(grids, asked))
         point.seconds.append(seconds)
+        point.filling = seconds - run.asking - run.tracing
         point.light.append(look_up(grids, asked))
         return point, grids
 
@@ -307,13 +311,23 @@ class Race:
         return min(able, key=lambda lane: (lane.cost * self._lag(lane, standing), lane.run.grid), default=None)
 
     def front_ladders(self) -> dict[tuple[int, int, int], float]:
-        """Way, grid and most paths of the front's points that lack seeds, with the seconds of the longest of each."""
+        """Way, grid and most paths of the front's points that lack seeds, with the seconds that one more seed takes."""
+        best = front(self.points, self.truths)
         found: dict[tuple[int, int], Point] = {}
-        for point in front(self.points, self.truths):
+        for point in best:
             key = id(point.way), point.grid
             if point.built and len(point.seconds) < SEEDS and (key not in found or found[key].paths < point.paths):
                 found[key] = point
-        return {(*key, point.paths): point.time for key, point in found.items()}
+        return {
+            (*key, p.paths): p.time - p.filling + sum(q.filling for q in self._ladder(best, *key, p.paths))
+            for key, p in found.items()
+        }
+
+    def _ladder(self, best: list[Point], way: int, grid: int, most: int) -> list[Point]:
+        """What is run again together: a way on a grid, with so many paths or fewer, by the fillers of the front."""
+        fillers = {p.interpolator for p in best}
+        same = [p for p in self.points if id(p.way) == way and p.grid == grid and p.paths <= most and p.built]
+        return [p for p in same if p.interpolator in fillers]
 
     def repeat(self, deadline: float, tell: Callable[[], None], studio: Studio | None = None) -> None:
         """Run what the front consists of with other seeds, until every point on it has enough of them."""
@@ -321,9 +335,7 @@ class Race:
             way, grid, most = min(ladders, key=lambda key: ladders[key])
             if time.perf_counter() + ladders[way, grid, most] > deadline:
                 return
-            same = [p for p in self.points if id(p.way) == way and p.grid == grid and p.paths <= most and p.built]
-            fillers = {p.interpolator for p in front(self.points, self.truths)}
-            same = [p for p in same if p.interpolator in fillers]
+            same = self._ladder(front(self.points, self.truths), way, grid, most)
             again = max(len(p.seconds) for p in same if p.paths == most)
             seed = (self.seed + again) % 2**64
             run, before = Run(self.scene, same[0].way, grid, self.bounces, seed), resident(reset=True)
