@@ -196,7 +196,7 @@ def planned(
             followed = pilot.bounces_for(SHARE * goal)
         tried = _ladder(pilot, near, followed, pace, error, left)
         choice, more = choose(tried, pace, walls, error, left, paths), 0
-        if error is not None and choice.measured.split.uncertain > 0.1 * error**2:
+        if error is not None and choice.measured.split.uncertain > 0.05 * error**2:
             # A few points carry the error, as where the field is noisy: many more are needed to tell it.
             more = int(min(4 * points, 16384, max(SOON, choice.seconds) / look))
     about = 1 << 16 if seconds is None else int(np.clip(0.02 * left / pace.path, 1 << 12, 1 << 16))

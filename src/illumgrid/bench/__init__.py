@@ -96,9 +96,12 @@ def _thinned(truth: Truth, surface: str, spent: float, left: float, seed: int) -
 def _grown(
     truths: dict[str, Truth], tracers: dict[str, Backend], scene: Scene, seed: int, error: dict[str, float], left: float
 ) -> None:
-    """The truths with more paths, until their own errors are small enough or the time is over."""
+    """The truths with more paths, until their own errors are small enough or the time is over.
+
+    The first, which judges most, comes last: it has what the others leave.
+    """
     end = time.perf_counter() + left
-    for rest, (surface, truth) in zip(range(len(truths), 0, -1), list(truths.items())):
+    for rest, (surface, truth) in zip(range(len(truths), 0, -1), reversed(list(truths.items()))):
         spent, begun = 0.0, time.perf_counter()
         until = begun + (end - begun) / rest
         while truth.error > error[surface] and time.perf_counter() + 2 * spent < until and truth.paths < 1 << 15:

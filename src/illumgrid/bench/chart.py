@@ -24,6 +24,9 @@ SHOWN = 10
 COLUMNS = 4
 """Of the legend."""
 
+LABEL = (45.0, 11.0)
+"""Pixels that a label takes."""
+
 
 def draw(records: Sequence[dict[str, Any]], bars: Sequence[Bar], title: str) -> "Figure":
     """Figure with the race on the left, and where the error of the direct way comes from on the right."""
@@ -68,9 +71,9 @@ def race(axes: "Axes", records: Sequence[dict[str, Any]]) -> None:
         if r["default"]:
             axes.scatter(r["seconds"], 100 * r["rmse"], s=170, facecolor="none", edgecolor="black", linewidth=1.3,
                          zorder=5, label="run's default")  # fmt: skip
-    labelled(axes, front)
     axes.margins(0.08)
     axes.set(xscale="log", yscale="log", xlabel="seconds", ylabel="relative RMS error, % of the mean light")
+    labelled(axes, front)
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
         axis.set_major_formatter("{x:g}")
@@ -80,15 +83,21 @@ def race(axes: "Axes", records: Sequence[dict[str, Any]]) -> None:
 
 
 def labelled(axes: "Axes", front: Sequence[dict[str, Any]]) -> None:
-    """Nodes x paths below the points of the front, once for fillers that share them."""
-    last = ""
+    """Nodes x paths below the points of the front, or above where another label is in the way; once for all fillers."""
+    axes.autoscale_view()
+    last, taken = "", [(float("-inf"), 0.0)]
     for r in front:
         name = f"{r['grid']} x {r['paths']}"
         if name == last:
             continue
         last = name
-        axes.annotate(name, (r["seconds"], 100 * r["rmse"]), xytext=(-4, -5), fontsize=7,
-                      textcoords="offset points", ha="right", va="top", color="#444444", zorder=5)  # fmt: skip
+        point = r["seconds"], 100 * r["rmse"]
+        x, y = axes.transData.transform(point)
+        free = all(abs(x - a) > LABEL[0] or abs(y - b) > LABEL[1] for a, b in taken)
+        taken.append((x, y) if free else (x + LABEL[0], y + LABEL[1]))
+        axes.annotate(name, point, xytext=(-4, -5) if free else (4, 5), fontsize=7, textcoords="offset points",
+                      ha="right" if free else "left", va="top" if free else "bottom", color="#444444",
+                      zorder=5)  # fmt: skip
 
 
 def parts(axes: "Axes", bars: Sequence[Bar]) -> None:
