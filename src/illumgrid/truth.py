@@ -165,9 +165,11 @@ def _cells_by_step(field: Field) -> tuple[NDArray[np.int64], Floats]:
 
     Chosen all alike, the few cells around a small level set would hardly be met.
     """
-    low = high = np.clip(
-        np.floor((field.volume.values - field.range[0]) / (field.range[1] - field.range[0]) * _STEPS), -1, _STEPS
-    ).astype(np.int8)
+    lowest, highest = map(float, field.range)
+    share = field.volume.values - lowest  # of this size there is one array, single like the field
+    share *= _STEPS / (highest - lowest)
+    np.clip(np.floor(share, out=share), -1, _STEPS, out=share)
+    low = high = share.astype(np.int8)
     for axis in range(3):
         line, other = np.moveaxis(low, axis, 0), np.moveaxis(high, axis, 0)
         low = np.moveaxis(np.minimum(line[:-1], line[1:]), 0, axis)
