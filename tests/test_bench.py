@@ -15,6 +15,8 @@ from illumgrid.bench.contestants import COUNTS, Way, ways
 from illumgrid.bench.race import Point, Race, Run, covered, front
 from illumgrid.bench.whence import Bar
 from illumgrid.interpolators.nearest import Nearest
+from illumgrid.interpolators.rbf import Rbf
+from illumgrid.interpolators.splat import Splat
 from illumgrid.pilot import Pace
 from illumgrid.samplers.direct import Direct
 from illumgrid.samplers.uniform import Uniform
@@ -278,3 +280,13 @@ def test_points_are_given_up_for_a_sharper_truth_where_light_is_rough(truth):
     few = _thinned(many, "mesh", 1.0, 0.6 * (exact.error / 0.01) ** 2, 0)
     assert few.surface == "mesh" and abs(len(few) - 1200) <= 1
     assert len(_thinned(many, "mesh", 1.0, 1e-9, 0)) == 500
+
+
+def test_time_is_kept_for_all_that_another_seed_takes(truth):
+    scene, exact = truth
+    race = Race(scene, {"levelset": exact}, [WAY], [8], 3, 0)
+    plain, filled, beaten = point(exact, 1.0, 0.2, seeds=1), point(exact, 1.5, 0.1, seeds=1), point(exact, 9.0, 0.3)
+    filled.interpolator, beaten.interpolator = Splat(), Rbf()
+    plain.filling, filled.filling, beaten.filling = 0.1, 0.6, 8.0
+    race.points = [plain, filled, beaten]
+    assert race.front_ladders() == {(id(WAY), 8, 4): pytest.approx(0.9 + 0.1 + 0.6)}
