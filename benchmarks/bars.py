@@ -12,9 +12,9 @@ import numpy as np
 from stability import IMAGES, hills
 
 import illumgrid as ig
-from illumgrid.samples import join_queries
+from illumgrid.field.volume import Volume, smooth
 from illumgrid.stages import on_level_sets
-from illumgrid.volume import Volume, smooth
+from illumgrid.transport.samples import join_queries
 
 SIDE = 48
 REAL = {

@@ -30,13 +30,13 @@ import numpy as np
 from rays import gaussians
 
 from illumgrid import Queries, Scene, Volume, backend, isosurface, read_volume, run
-from illumgrid.bench import bench, report, sizes
-from illumgrid.bench.contestants import ways as every_way
-from illumgrid.bench.race import SEEDS, Race, front
-from illumgrid.plan import planned
-from illumgrid.scene import level_table
-from illumgrid.truth import begin, converge, errors, look_up, trace, unseen_on_level_sets
-from illumgrid.volume import smooth
+from illumgrid.accuracy.chart import bench, report, sizes
+from illumgrid.accuracy.chart.contestants import ways as every_way
+from illumgrid.accuracy.chart.race import SEEDS, Race, front
+from illumgrid.accuracy.choose import planned
+from illumgrid.accuracy.truth import begin, converge, errors, look_up, trace, unseen_on_level_sets
+from illumgrid.field.scene import level_table
+from illumgrid.field.volume import smooth
 
 ROOT = Path(__file__).resolve().parents[1]
 BOUNCES = 6

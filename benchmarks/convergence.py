@@ -15,8 +15,8 @@ from rays import gaussians
 from stability import hills
 
 from illumgrid import Material, Quad, Scene, Volume, backend
-from illumgrid.samples import join_queries
 from illumgrid.stages import on_level_sets
+from illumgrid.transport.samples import join_queries
 
 IMAGES = Path(__file__).parent.parent / "docs" / "images"
 COUNTS = 4 * 2 ** np.arange(8)

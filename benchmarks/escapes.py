@@ -12,11 +12,11 @@ from itertools import product
 
 import numpy as np
 
-from illumgrid.samples import Queries, join_queries
-from illumgrid.scene import Field, Material, Scene, box_around
+from illumgrid.accuracy.verify import contenders
+from illumgrid.field.scene import Field, Material, Scene, box_around
+from illumgrid.field.volume import Volume
 from illumgrid.stages import on_level_sets
-from illumgrid.verify import contenders
-from illumgrid.volume import Volume
+from illumgrid.transport.samples import Queries, join_queries
 
 BOUNCES = 6
 WALL = 300.0  # solid at all levels

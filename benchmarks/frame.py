@@ -22,11 +22,11 @@ import numpy as np
 from rays import ISOVALUE, gaussians, race
 
 from illumgrid import Scene, isosurface
+from illumgrid.field.scene import level_table
 from illumgrid.grid import GridSpec, IlluminationGrid
-from illumgrid.illumination import Illumination
-from illumgrid.preview import choose_engine, fit_camera, gl, meshes
-from illumgrid.preview.shade import BACKGROUND, Shown
-from illumgrid.scene import level_table
+from illumgrid.light import Illumination
+from illumgrid.show.render import choose_engine, fit_camera, gl, meshes
+from illumgrid.show.shade import BACKGROUND, Shown
 from illumgrid.tone import srgb_curve
 
 NODES, WIDTH, HEIGHT = 96, 800, 600

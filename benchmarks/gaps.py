@@ -17,11 +17,11 @@ from scipy.spatial import KDTree
 
 from illumgrid import GridSpec, Scene, interpolator, isosurface, read_volume
 from illumgrid import backend as backend_named
+from illumgrid.field.scene import level_table
+from illumgrid.field.volume import index_to_world, interpolate, smooth
 from illumgrid.samplers.adaptive import adaptive_rows
-from illumgrid.samples import join_queries
-from illumgrid.scene import level_table
 from illumgrid.stages import on_level_sets
-from illumgrid.volume import index_to_world, interpolate, smooth
+from illumgrid.transport.samples import join_queries
 
 POINTS, BINS = 50_000, 25
 

@@ -12,11 +12,11 @@ from pathlib import Path
 import numpy as np
 from playwright.sync_api import Browser, Page, sync_playwright
 
+from illumgrid.field.scene import Scene, level_table
+from illumgrid.field.volume import Volume
 from illumgrid.grid import GridSpec, IlluminationGrid
-from illumgrid.illumination import Illumination
-from illumgrid.scene import Scene, level_table
-from illumgrid.viewer import page
-from illumgrid.volume import Volume
+from illumgrid.light import Illumination
+from illumgrid.show.viewer import page
 
 ARGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-first-run", "--disable-sync"]
 FRAME = """(light) => {

@@ -19,10 +19,10 @@ from dataclasses import replace
 import numpy as np
 from rays import gaussians
 
+from illumgrid.accuracy.verify import contenders
 from illumgrid.backends import meshes
-from illumgrid.scene import Scene
+from illumgrid.field.scene import Scene
 from illumgrid.stages import on_level_sets
-from illumgrid.verify import contenders
 
 LEVEL, ROUNDS, QUERIES = 0.4, 5, 2000
 PATHS = {"numba:levelset": 64, "numba:mesh": 64, "embree": 16}  # reference is for reading, some 500 times slower

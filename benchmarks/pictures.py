@@ -13,9 +13,9 @@ import numpy as np
 from PIL import Image
 
 import illumgrid as ig
-from illumgrid.preview import render
-from illumgrid.scene import upright
-from illumgrid.volume import index_to_world, smooth
+from illumgrid.field.scene import upright
+from illumgrid.field.volume import index_to_world, smooth
+from illumgrid.show.render import render
 
 IMAGES = Path(__file__).parents[1] / "docs" / "images"
 

@@ -29,7 +29,8 @@ from scipy.ndimage import gaussian_filter
 from illumgrid import Queries, Scene, Volume, isosurface
 from illumgrid.backends import bvh
 from illumgrid.backends.kernels import NOWHERE, nearest_hit
-from illumgrid.levelset import in_frame, marchable
+from illumgrid.field.levelset import marchable
+from illumgrid.transport.samples import in_frame
 
 RAYS, ROUNDS = 200_000, 9
 ISOVALUE, WALL = 0.4, 0.31

@@ -14,10 +14,10 @@ from pathlib import Path
 import numpy as np
 
 import illumgrid as ig
-from illumgrid.samples import join_queries
-from illumgrid.scene import Material, Scene
-from illumgrid.truth import begin, converge, errors, look_up, unseen_on_level_sets
-from illumgrid.volume import Volume
+from illumgrid.accuracy.truth import begin, converge, errors, look_up, unseen_on_level_sets
+from illumgrid.field.scene import Material, Scene
+from illumgrid.field.volume import Volume
+from illumgrid.transport.samples import join_queries
 
 METHODS = {
     "direct": ("direct", "nearest"),

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from illumgrid import preview
+from illumgrid.field.scene import Field, Material, Scene, box_around, level_table, upright
 from illumgrid.grid import GridSpec, IlluminationGrid, WallTexture
-from illumgrid.illumination import Illumination
-from illumgrid.preview.camera import fit_camera
-from illumgrid.scene import Field, Material, Scene, box_around, level_table, upright
-from illumgrid.viewer import page
-from illumgrid.viewer.packing import Stage
+from illumgrid.light import Illumination
+from illumgrid.show import render as preview
+from illumgrid.show.camera import fit_camera
+from illumgrid.show.viewer import page
+from illumgrid.show.viewer.packing import Stage
 from shapes import MIRRORED, ball, sampled
 
 CHROMIUM = next((p for p in ("/usr/bin/chromium", "/usr/bin/chromium-browser") if Path(p).exists()), None)

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from illumgrid import cli, preview
+from illumgrid import cli
+from illumgrid.show import render as preview
 from shapes import ball
 
 

@@ -21,10 +21,10 @@ from pathlib import Path
 import numpy as np
 import SimpleITK as sitk  # noqa: N813
 
-from illumgrid import store
 from illumgrid.errors import BadInput
-from illumgrid.illumination import Illumination
-from illumgrid.readers import read_scene, read_volume
+from illumgrid.io import store
+from illumgrid.io.readers import read_scene, read_volume
+from illumgrid.light import Illumination
 from test_store import example
 from test_store_trust import reseal
 from volume_files import values, write, write_series

@@ -2,9 +2,9 @@
 
 import numpy as np
 
+from illumgrid.field.scene import Field, Material, Scene, level_table
 from illumgrid.grid import GridSpec, IlluminationGrid, fill_holes
-from illumgrid.illumination import Illumination
-from illumgrid.scene import Field, Material, Scene, level_table
+from illumgrid.light import Illumination
 from shapes import sampled
 
 ORIGIN, SPACING, SHAPE = (3.0, -40.0, 10.5), (0.5, 1.25, 2.0), (9, 7, 6)

@@ -2,7 +2,7 @@
 
 Written from the specification alone, one ray and one cell at a time, to be obviously right rather than fast: cells come
 from sorting all crossings of the ray with the planes of the lattice, roots from bisection between stationary points.
-Points, directions and normals are lists of three floats in the frame of the scene (see `illumgrid.scene.Scene`).
+Points, directions and normals are lists of three floats in the frame of the scene (see `illumgrid.field.scene.Scene`).
 """
 
 import math

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 import naive
-from illumgrid.levelset import isosurface
+from illumgrid.field.levelset import isosurface
 
 OFF = 1e-6  # of the extent: how far a ray starts beside a surface
 

@@ -5,9 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from illumgrid.samples import Queries
-from illumgrid.scene import Field, Material, Quad, Scene, box_around
-from illumgrid.volume import Volume
+from illumgrid.field.scene import Field, Material, Quad, Scene, box_around
+from illumgrid.field.volume import Volume
+from illumgrid.transport.samples import Queries
 from transport import ALBEDO, EMISSION, SKY, noise, rotation, sidak, waves
 
 NOWHERE = 9.0

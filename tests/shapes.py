@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from illumgrid.errors import BadInput
+from illumgrid.field.scene import Scene, level_table
+from illumgrid.field.volume import Volume
 from illumgrid.grid import GridSpec, IlluminationGrid, WallTexture
-from illumgrid.illumination import Illumination
-from illumgrid.scene import Scene, level_table
-from illumgrid.volume import Volume
+from illumgrid.light import Illumination
 
 
 def rotation(axis, angle):

@@ -5,12 +5,12 @@ import pytest
 from scipy.spatial import KDTree
 from skimage.measure import euler_number
 
+from illumgrid.field.scene import Field, Scene, level_table
+from illumgrid.field.volume import Volume, index_to_world
 from illumgrid.grid import GridSpec
 from illumgrid.samplers.adaptive import Adaptive, adaptive_rows, critical_values, distance_between
-from illumgrid.samples import join_queries
-from illumgrid.scene import Field, Scene, level_table
 from illumgrid.stages import Sampler
-from illumgrid.volume import Volume, index_to_world
+from illumgrid.transport.samples import join_queries
 from shapes import MIRRORED, ball, refused, sampled, sky
 
 UNEVEN = np.array([0.5, 1.25, 2.0])

@@ -5,13 +5,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from illumgrid import analytic, cli, registry, verify
+from illumgrid import cli, registry
+from illumgrid.accuracy import verify
+from illumgrid.accuracy.verify import check, judge, sidak
 from illumgrid.backends.numba_ import Numba
 from illumgrid.errors import BadInput
-from illumgrid.samples import Queries, Samples
-from illumgrid.scene import Material, Quad
-from illumgrid.verify import check, judge, sidak
-from illumgrid.volume import interpolate, world_to_index
+from illumgrid.field.scene import Material, Quad
+from illumgrid.field.volume import interpolate, world_to_index
+from illumgrid.transport import analytic
+from illumgrid.transport.samples import Queries, Samples
 
 
 @pytest.fixture(scope="module")

@@ -5,8 +5,8 @@ import pytest
 
 import illumgrid as ig
 from illumgrid.grid import GridSpec, IlluminationGrid
-from illumgrid.samples import join_queries
 from illumgrid.stages import on_level_sets
+from illumgrid.transport.samples import join_queries
 from shapes import sampled
 
 

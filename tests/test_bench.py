@@ -8,21 +8,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from illumgrid.accuracy.chart import _remarks, _show_default, _thinned, bench, chart, told
+from illumgrid.accuracy.chart import sizes as sizes_of
+from illumgrid.accuracy.chart.contestants import COUNTS, Way, ways
+from illumgrid.accuracy.chart.race import Point, Race, Run, covered, front
+from illumgrid.accuracy.chart.whence import Bar
+from illumgrid.accuracy.parts import Split
+from illumgrid.accuracy.probe import Pace
+from illumgrid.accuracy.truth import Truth, begin, errors, unseen_on_level_sets
 from illumgrid.backends.numba_ import Numba
-from illumgrid.bench import _remarks, _show_default, _thinned, bench, chart, told
-from illumgrid.bench import sizes as sizes_of
-from illumgrid.bench.contestants import COUNTS, Way, ways
-from illumgrid.bench.race import Point, Race, Run, covered, front
-from illumgrid.bench.whence import Bar
+from illumgrid.field.scene import Scene
 from illumgrid.interpolators.nearest import Nearest
 from illumgrid.interpolators.rbf import Rbf
 from illumgrid.interpolators.splat import Splat
-from illumgrid.pilot import Pace
 from illumgrid.samplers.direct import Direct
 from illumgrid.samplers.uniform import Uniform
-from illumgrid.scene import Scene
-from illumgrid.split import Split
-from illumgrid.truth import Truth, begin, errors, unseen_on_level_sets
 from shapes import ball, refused, sky
 
 BACKEND = Numba()
@@ -261,7 +261,7 @@ def test_a_default_that_is_too_costly_is_foreseen_and_so_are_its_neighbours(trut
     said = _show_default(race, 11, 32, 1e-6)
     assert "~" in said[0] and [(p.grid, p.paths, p.built) for p in race.points] == [(11, 32, False)]
     with monkeypatch.context() as patch:  # a second a path: there is time for three seeds of 8 paths, not of 32
-        patch.setattr("illumgrid.bench.timed", lambda *_: Pace(0.0, 1.0))
+        patch.setattr("illumgrid.accuracy.chart.timed", lambda *_: Pace(0.0, 1.0))
         race = Race(scene, {"levelset": exact}, [WAY], [5, 11, 22], 3, 0)
         _show_default(race, 22, 32, (3 * 8 * 8 * len(exact) + 1000) / 0.15)
     assert {(p.grid, p.paths, p.default) for p in race.points} == {(22, 32, True), (11, 8, False), (22, 8, False)}

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from illumgrid.bricks import BRICK, RANKS, REACH, lay_bricks
+from illumgrid.field.bricks import BRICK, RANKS, REACH, lay_bricks
 
 SHAPES = [(2, 2, 2), (5, 5, 5), (6, 9, 4), (37, 22, 81)]
 

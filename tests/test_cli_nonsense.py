@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 import typer
 
-from illumgrid import cli, preview, registry
-from illumgrid.options import options
+from illumgrid import cli, registry
+from illumgrid.registry.options import options
+from illumgrid.show import render as preview
 from shapes import ball
 
 COMMANDS = typer.main.get_command(cli.app).commands

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import illumgrid as ig
-from illumgrid import demo
+from illumgrid.field import builtin as demo
 from shapes import ball
 
 QUICK = ("--grid", "6", "--paths", "2", "--isovalues", "2", "--no-preview")

@@ -9,14 +9,14 @@ from illumgrid.backends.numba_ import Numba, cores
 from illumgrid.backends.reference import Reference
 from illumgrid.bake import bake
 from illumgrid.errors import BadInput
+from illumgrid.field.scene import level_table
 from illumgrid.grid import GridSpec
 from illumgrid.interpolators.nearest import Nearest
 from illumgrid.samplers import direct
 from illumgrid.samplers.direct import Direct
 from illumgrid.samplers.uniform import Uniform
-from illumgrid.samples import join_queries
-from illumgrid.scene import level_table
 from illumgrid.stages import on_level_sets
+from illumgrid.transport.samples import join_queries
 from transport import colored, everywhere, furnace, noise, waves
 
 BACKENDS = {"numba": Numba(), "reference": Reference()}

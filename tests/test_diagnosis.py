@@ -6,13 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import illumgrid as ig
-from illumgrid.demo import SCENES
-from illumgrid.diagnosis import critical_isovalues, diagnose, plateaus, topology, turning
 from illumgrid.errors import WARNINGS, tell
+from illumgrid.field.builtin import SCENES
+from illumgrid.field.diagnosis import critical_isovalues, diagnose, plateaus, topology, turning
+from illumgrid.field.scene import Field
+from illumgrid.field.volume import Volume, interpolate, smooth, world_to_index
 from illumgrid.grid import GridSpec
-from illumgrid.scene import Field
-from illumgrid.volume import Volume, smooth
 from shapes import DIRECTIONS, ball, sampled
 
 
@@ -64,8 +63,8 @@ def test_every_plateau_is_named_with_its_share_and_place(axes):
     assert [value for value, _, _ in found] == [0.25, 0.625]
     assert found[0][1] == pytest.approx(5 * 3 * 4 / 19**3)
     for value, _, place in found:
-        at = ig.volume.world_to_index(volume, place[None])
-        assert ig.volume.interpolate(volume, at)[0] == pytest.approx(value)
+        at = world_to_index(volume, place[None])
+        assert interpolate(volume, at)[0] == pytest.approx(value)
     assert list(findings(volume, (0.3, 0.5))) == []
     told = findings(volume, (0.3, 0.625))
     assert list(told) == ["plateau"] and "0.625 (" in told["plateau"] and "0.25 (" not in told["plateau"]

@@ -10,12 +10,12 @@ import pytest
 from illumgrid.backends.numba_ import Numba
 from illumgrid.backends.reference import Reference
 from illumgrid.bake import bake
+from illumgrid.field.scene import Field, Scene, level_table
+from illumgrid.field.volume import Volume, outward_normals, smooth_gradient
 from illumgrid.grid import GridSpec
 from illumgrid.interpolators.nearest import Nearest
 from illumgrid.samplers.direct import Direct
-from illumgrid.samples import Queries
-from illumgrid.scene import Field, Scene, level_table
-from illumgrid.volume import Volume, outward_normals, smooth_gradient
+from illumgrid.transport.samples import Queries
 from transport import assert_standard_normal, colored, furnace, noise, on_sets, on_voxels, rotation, voxels, waves
 
 SHAPE, PATHS = (10, 8, 9), 600

@@ -6,11 +6,11 @@ import pytest
 import pyvista as pv
 import SimpleITK as sitk  # noqa: N813
 
-from illumgrid import exports
-from illumgrid.exports.arrays import certainty
-from illumgrid.levelset import isosurface
-from illumgrid.readers import read_volume
-from illumgrid.volume import index_to_world, interpolate, world_to_index
+from illumgrid.field.levelset import isosurface
+from illumgrid.field.volume import index_to_world, interpolate, world_to_index
+from illumgrid.io import exports
+from illumgrid.io.exports.arrays import certainty
+from illumgrid.io.readers import read_volume
 from lights import lopsided_light
 from shapes import DIRECTIONS, refused
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from illumgrid import illumination
+from illumgrid import chain as illumination
 from lights import lopsided_light
 from shapes import DIRECTIONS
 

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 import trimesh
 
-from illumgrid import exports
-from illumgrid.levelset import isosurface
+from illumgrid.field.levelset import isosurface
+from illumgrid.field.volume import interpolate, world_to_index
+from illumgrid.io import exports
 from illumgrid.tone import encode_srgb
-from illumgrid.volume import interpolate, world_to_index
 from lights import lopsided_light
 from shapes import DIRECTIONS, refused
 

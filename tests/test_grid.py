@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from illumgrid.field.volume import Volume, index_to_world
 from illumgrid.grid import GridSpec, IlluminationGrid, fill_holes, read_lattice
-from illumgrid.volume import Volume, index_to_world
 from shapes import DIRECTIONS, MIRRORED, refused
 
 UNEVEN = np.array([0.5, 1.25, 3.0])

@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 import illumgrid as ig
-from illumgrid import preview
+from illumgrid.show import render as preview
 from illumgrid.tone import encode_srgb
 from shapes import ball, lit, refused, sky
 
@@ -195,7 +195,7 @@ def test_progress_tells_what_is_done_of_how_much():
 
 
 def test_two_fields_of_the_built_in_nucleus_light_each_other():
-    from illumgrid.demo import SCENES
+    from illumgrid.field.builtin import SCENES
 
     scene = SCENES["nucleus"].make()
     light = ig.run(scene, grid=10, paths=4, bounces=2)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from illumgrid import exports
+from illumgrid.io import exports
 from shapes import ball, lit, sky
 
 PAGE = (Path(__file__).parents[1] / "docs" / "in_pyvista.md").read_text(encoding="utf-8")

@@ -3,15 +3,15 @@
 import numpy as np
 import pytest
 
+from illumgrid.field.volume import Volume
 from illumgrid.grid import GridSpec
 from illumgrid.interpolators import neighbours, spline
 from illumgrid.interpolators.nearest import Nearest
 from illumgrid.interpolators.rbf import Rbf
 from illumgrid.interpolators.splat import Splat
 from illumgrid.samplers.direct import Direct
-from illumgrid.samples import Queries, Samples, join_queries
 from illumgrid.stages import Interpolator
-from illumgrid.volume import Volume
+from illumgrid.transport.samples import Queries, Samples, join_queries
 from shapes import MIRRORED, ball, refused, sky
 
 UNEVEN = np.array([0.5, 1.25, 3.0])

@@ -9,9 +9,9 @@ import naive
 from illumgrid.backends import kernels
 from illumgrid.backends.numba_ import Numba
 from illumgrid.backends.reference import Reference
-from illumgrid.levelset import marchable, upward
-from illumgrid.scene import Scene
-from illumgrid.volume import Volume, interpolate, outward_normals
+from illumgrid.field.levelset import marchable, upward
+from illumgrid.field.scene import Scene
+from illumgrid.field.volume import Volume, interpolate, outward_normals
 from transport import ALBEDO, colored, everywhere, furnace, linear, noise, on_sets, on_voxels, rotation, waves, worth
 
 pytestmark = pytest.mark.plain

@@ -10,9 +10,9 @@ import naive
 from illumgrid.backends.numba_ import Numba
 from illumgrid.backends.reference import Reference
 from illumgrid.bake import wall_queries
-from illumgrid.samples import join_queries
-from illumgrid.scene import Field, Material, Scene, box_around, level_table
-from illumgrid.volume import interpolate, world_to_index
+from illumgrid.field.scene import Field, Material, Scene, box_around, level_table
+from illumgrid.field.volume import interpolate, world_to_index
+from illumgrid.transport.samples import join_queries
 from rooms import NOWHERE, ROOMS, at_levels, box, empty, lamps, on_quads, painted
 from transport import everywhere, noise, rotation, waves, worth
 

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from numba import typeof
 
-from illumgrid.levelset import in_frame, isosurface, marchable, off_the_data, turned, upward
-from illumgrid.samples import Queries
-from illumgrid.scene import Field, Material, Scene
-from illumgrid.volume import Volume, world_to_index
+from illumgrid.field.levelset import isosurface, marchable, off_the_data, turned, upward
+from illumgrid.field.scene import Field, Material, Scene
+from illumgrid.field.volume import Volume, world_to_index
+from illumgrid.transport.samples import Queries, in_frame
 from shapes import DIRECTIONS, MIRRORED, ball, refused, sampled, sky
 
 UNEVEN = np.array([0.5, 1.25, 3.0])

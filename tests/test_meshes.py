@@ -17,12 +17,12 @@ from illumgrid.backends.meshes import LevelMesh, level_mesh, meshed, row_groups
 from illumgrid.backends.numba_ import Numba
 from illumgrid.backends.reference import answer
 from illumgrid.errors import BadInput
-from illumgrid.levelset import in_frame, isosurface
+from illumgrid.field.levelset import isosurface
+from illumgrid.field.scene import Scene
+from illumgrid.field.volume import Volume
 from illumgrid.rng import stream
-from illumgrid.samples import Queries, Samples, join_queries
-from illumgrid.scene import Scene
 from illumgrid.stages import on_level_sets
-from illumgrid.volume import Volume
+from illumgrid.transport.samples import Queries, Samples, in_frame, join_queries
 from rooms import MIRRORED, ROOMS, on_quads
 from shapes import sampled
 from transport import colored, furnace, noise, on_sets, on_voxels, rotation, waves, worth

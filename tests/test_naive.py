@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import naive
-from illumgrid.samples import Queries
-from illumgrid.scene import Field, Material, Scene
-from illumgrid.volume import Volume, interpolate, outward_normals
+from illumgrid.field.scene import Field, Material, Scene
+from illumgrid.field.volume import Volume, interpolate, outward_normals
+from illumgrid.transport.samples import Queries
 
 SKY = (1.0, 1.0, 1.0)
 ALBEDO = np.array([0.8, 0.5, 0.2])

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from browser import browser, coloured, pair  # noqa: F401
-from illumgrid.viewer.widget import _widget_class
+from illumgrid.show.viewer.widget import _widget_class
 from shapes import lit, refused, sky
 
 pytestmark = pytest.mark.filterwarnings("default")  # of Jupyter's packages

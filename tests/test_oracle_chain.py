@@ -9,8 +9,8 @@ import pytest
 import naive
 from illumgrid.backends.numba_ import Numba
 from illumgrid.backends.reference import Reference
-from illumgrid.scene import Field, Material, Scene
-from illumgrid.volume import Volume
+from illumgrid.field.scene import Field, Material, Scene
+from illumgrid.field.volume import Volume
 from transport import ALBEDO, EMISSION, colored, everywhere, furnace, noise, rotation, waves, worth
 
 SAME = 1e-6  # of π, on irradiance: a path that takes another turn is off by far more

@@ -161,7 +161,7 @@ def test_a_look_says_that_it_is_an_effect_of_display(browser, look):  # noqa: F8
 
 
 def test_a_browser_without_webgl2_gets_a_sentence(browser):  # noqa: F811
-    from illumgrid.viewer import page as built
+    from illumgrid.show.viewer import page as built
 
     page = browser.context.new_page()
     page.add_init_script("HTMLCanvasElement.prototype.getContext = () => null")

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from browser import coloured, pair
-from illumgrid.preview import render
+from illumgrid.show.render import render
 from illumgrid.tone import encode_srgb
 from shapes import lit, sky
 from test_cli_process import COMMAND
@@ -63,7 +63,7 @@ WINDOW = """
 import sys
 import numpy as np
 from browser import coloured, pair
-from illumgrid.viewer.desktop import Window
+from illumgrid.show.viewer.desktop import Window
 window = Window(coloured(pair()), off_screen=True)
 window.plotter.window_size = [330, 240]
 pictures = []

@@ -9,13 +9,13 @@ import urllib.request
 import numpy as np
 import pytest
 
-import illumgrid.viewer.packing as packing
+import illumgrid.show.viewer.packing as packing
 from browser import bent, coloured, pair
-from illumgrid.levelset import turned
-from illumgrid.viewer import MODULES, SHADERS, compressed, page, script, source
-from illumgrid.viewer.packing import Stage, field_steps, packed, reduced
-from illumgrid.viewer.server import serve
-from illumgrid.volume import Volume, index_to_world
+from illumgrid.field.levelset import turned
+from illumgrid.field.volume import Volume, index_to_world
+from illumgrid.show.viewer import MODULES, SHADERS, compressed, page, script, source
+from illumgrid.show.viewer.packing import Stage, field_steps, packed, reduced
+from illumgrid.show.viewer.server import serve
 from shapes import MIRRORED, ball, sampled, sky
 
 LIGHT = coloured(pair())

@@ -4,15 +4,24 @@ import numpy as np
 import pytest
 
 from illumgrid import run
+from illumgrid.accuracy.choose import Plan, choose, judge, planned, rounds, sizes
+from illumgrid.accuracy.parts import Split, split
+from illumgrid.accuracy.probe import Measured, Pace, Pilot, corners
+from illumgrid.accuracy.truth import (
+    Truth,
+    apart,
+    begin,
+    converge,
+    errors,
+    look_up,
+    unseen_in_volume,
+    unseen_on_level_sets,
+)
 from illumgrid.backends.numba_ import Numba
+from illumgrid.field.scene import Scene, level_table
+from illumgrid.field.volume import interpolate, world_to_index
 from illumgrid.grid import IlluminationGrid
-from illumgrid.pilot import Measured, Pace, Pilot, corners
-from illumgrid.plan import Plan, choose, judge, planned, rounds, sizes
-from illumgrid.samples import Queries, Samples
-from illumgrid.scene import Scene, level_table
-from illumgrid.split import Split, split
-from illumgrid.truth import Truth, apart, begin, converge, errors, look_up, unseen_in_volume, unseen_on_level_sets
-from illumgrid.volume import interpolate, world_to_index
+from illumgrid.transport.samples import Queries, Samples
 from shapes import ball, refused, sampled, sky
 
 BACKEND = Numba()

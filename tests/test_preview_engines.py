@@ -9,11 +9,11 @@ from functools import cache
 import numpy as np
 import pytest
 
-from illumgrid import preview
 from illumgrid.errors import BadInput
-from illumgrid.preview import choose_engine, gl, grid_volume, render
-from illumgrid.preview.shade import BACKGROUND
-from illumgrid.scene import Field, Material, Scene, box_around
+from illumgrid.field.scene import Field, Material, Scene, box_around
+from illumgrid.show import render as preview
+from illumgrid.show.render import choose_engine, gl, grid_volume, render
+from illumgrid.show.shade import BACKGROUND
 from illumgrid.tone import encode_srgb
 from shapes import MIRRORED, OBLIQUE, ball, lit, refused, sampled, sky
 
@@ -99,7 +99,7 @@ def child(script, folder, **environment):
 
 DRAW = """
 import sys, numpy as np
-from illumgrid.preview import gl
+from illumgrid.show.render import gl
 reason = gl.unavailable("{platform}")
 if reason:
     sys.exit("missing: " + reason)
@@ -164,7 +164,7 @@ ctypes.CDLL.__init__ = hidden
 """
 
 CHOOSE = """
-from illumgrid.preview import choose_engine, render
+from illumgrid.show.render import choose_engine, render
 from test_preview_engines import lit, sky
 engine, why = choose_engine("auto")
 picture = render(lit(sky()), engine=engine, width=40, height=30)
@@ -231,7 +231,7 @@ def test_software_is_asked_for_without_a_look_at_opengl(monkeypatch):
 
 def test_only_one_file_imports_pyrender_and_only_when_it_draws():
     done = subprocess.run(
-        [sys.executable, "-c", "import sys, illumgrid.preview, illumgrid.cli; print('pyrender' in sys.modules)"],
+        [sys.executable, "-c", "import sys, illumgrid.show.render, illumgrid.cli; print('pyrender' in sys.modules)"],
         capture_output=True, text=True,
     )  # fmt: skip
     assert done.stdout.strip() == "False"

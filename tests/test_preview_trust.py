@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from illumgrid.preview import render, trust
-from illumgrid.preview.trust import HIGH, LOW, SMALLEST, doubts, scale, scale_colors
+from illumgrid.show import trust
+from illumgrid.show.render import render
+from illumgrid.show.trust import HIGH, LOW, SMALLEST, doubts, scale, scale_colors
 from illumgrid.tone import decode_srgb, encode_srgb
 from shapes import DIRECTIONS, ball, lit, refused, sky
 from test_tone_preview import three_balls
@@ -90,7 +91,7 @@ def test_a_hole_is_striped_in_red_and_nothing_else_is(direction):
 
 
 def test_walls_and_caps_have_no_color_that_could_be_taken_for_a_bar():
-    from illumgrid.scene import Scene
+    from illumgrid.field.scene import Scene
 
     light = barred(0.05, Scene.box(ball(12), range=(0.1, 0.9), albedo=(0.9, 0.2, 0.2)))
     picture = render(light, isovalue=0.1, trust=True, **SIZE).astype(int)

@@ -5,7 +5,7 @@ import warnings
 import numpy as np
 import pytest
 
-from illumgrid.volume import Volume, interpolate, project
+from illumgrid.field.volume import Volume, interpolate, project
 from shapes import ball
 from test_volume import UNEVEN, noise, within
 

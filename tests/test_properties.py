@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from illumgrid.backends.numba_ import Numba
-from illumgrid.samples import Queries
-from illumgrid.scene import Field, Material, Scene, box_around
-from illumgrid.volume import Volume, index_to_world
+from illumgrid.field.scene import Field, Material, Scene, box_around
+from illumgrid.field.volume import Volume, index_to_world
+from illumgrid.transport.samples import Queries
 from transport import assert_standard_normal
 
 laws = settings(max_examples=12, deadline=None, derandomize=True, database=None)

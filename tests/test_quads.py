@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import illumgrid as ig
-from illumgrid.levelset import marchable
-from illumgrid.scene import Field, Material, Quad, Scene, box_around, upright
-from illumgrid.volume import Volume, index_to_world
+from illumgrid.field.levelset import marchable
+from illumgrid.field.scene import Field, Material, Quad, Scene, box_around, upright
+from illumgrid.field.volume import Volume, index_to_world
 from shapes import DIRECTIONS, ball, refused
 
 X, Y, Z = np.eye(3)

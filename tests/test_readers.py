@@ -9,8 +9,8 @@ import SimpleITK as sitk  # noqa: N813
 import tifffile
 
 from illumgrid.errors import IllumgridWarning
-from illumgrid.readers import read_volume, volume_name
-from illumgrid.volume import index_to_world
+from illumgrid.field.volume import index_to_world
+from illumgrid.io.readers import read_volume, volume_name
 from volume_files import (
     ORIGIN,
     SPACING,

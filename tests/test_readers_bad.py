@@ -15,7 +15,7 @@ import pytest
 import SimpleITK as sitk  # noqa: N813
 import tifffile
 
-from illumgrid.readers import read_volume
+from illumgrid.io.readers import read_volume
 from volume_files import meta_head, nrrd_head, refused, refused_lightly, values, vtk_head, write, zipped
 
 WRITERS = ["nrrd", "nii", "mha", "mrc", "vtk", "gipl", "tif", "dcm", "h5", "npy", "npz"]

@@ -7,8 +7,8 @@ import pytest
 import pyvista as pv
 from vtkmodules.vtkIOXML import vtkXMLImageDataWriter
 
-from illumgrid.readers import read_volume, volume_name
-from illumgrid.volume import index_to_world
+from illumgrid.field.volume import index_to_world
+from illumgrid.io.readers import read_volume, volume_name
 from volume_files import ORIGIN, SPACING, TURN, refused, refused_lightly, values, zipped
 
 

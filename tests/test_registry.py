@@ -7,7 +7,7 @@ import pytest
 
 import illumgrid as ig
 from illumgrid import registry
-from illumgrid.options import options, parse, short
+from illumgrid.registry.options import options, parse, short
 from shapes import refused
 
 SAMPLER = """

@@ -8,10 +8,10 @@ import pytest
 
 from illumgrid.backends.numba_ import Numba
 from illumgrid.bake import wall_queries
-from illumgrid.levelset import isosurface
-from illumgrid.scene import Field, Levels, Material, Scene, box_around
+from illumgrid.field.levelset import isosurface
+from illumgrid.field.scene import Field, Levels, Material, Scene, box_around
+from illumgrid.field.volume import cell_gradient, world_to_index
 from illumgrid.stages import on_level_sets
-from illumgrid.volume import cell_gradient, world_to_index
 from rooms import MIRRORED, NOWHERE, assert_mean, at_levels, empty, lamp, on_quads, painted
 from shapes import sampled
 from transport import ALBEDO, noise, on_voxels, rotation, waves

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from illumgrid.field.scene import Field, Scene, level_table
+from illumgrid.field.volume import Volume, interpolate, world_to_index
 from illumgrid.grid import GridSpec
 from illumgrid.samplers import direct
 from illumgrid.samplers.direct import Direct, reachable
 from illumgrid.samplers.uniform import Uniform
-from illumgrid.samples import join_queries
-from illumgrid.scene import Field, Scene, level_table
 from illumgrid.stages import Sampler, on_level_sets
-from illumgrid.volume import Volume, interpolate, world_to_index
+from illumgrid.transport.samples import join_queries
 from shapes import MIRRORED, ball, refused, sampled, sky
 
 UNEVEN = np.array([0.5, 1.25, 3.0])

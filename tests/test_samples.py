@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 import illumgrid as ig
-from illumgrid import samples as samples_of
-from illumgrid.samples import Queries, Samples, check_request, combine, join_queries, join_samples
-from illumgrid.scene import Field, Scene
-from illumgrid.volume import Volume, interpolate, world_to_index
+from illumgrid.field.scene import Field, Scene
+from illumgrid.field.volume import Volume, interpolate, world_to_index
+from illumgrid.transport import samples as samples_of
+from illumgrid.transport.samples import Queries, Samples, check_request, combine, join_queries, join_samples
 from shapes import DIRECTIONS, MIRRORED, ball, refused, sampled, sky
 
 

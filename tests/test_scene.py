@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from illumgrid.errors import IllumgridWarning
-from illumgrid.readers import read_volume
-from illumgrid.scene import Field, Material, Scene, level_table, suggest_range
-from illumgrid.volume import Volume
+from illumgrid.field.scene import Field, Material, Scene, level_table, suggest_range
+from illumgrid.field.volume import Volume
+from illumgrid.io.readers import read_volume
 from shapes import DIRECTIONS, MIRRORED, OBLIQUE, ball, refused, sky
 
 VOLUMES = Path(__file__).parents[2] / "shared" / "volumes"

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import illumgrid as ig
-from illumgrid.readers import scene_file
-from illumgrid.volume import smooth
+from illumgrid.field.volume import smooth
+from illumgrid.io.readers import scene_file
 from shapes import OBLIQUE, ball, refused
 
 WHOLE = """

@@ -14,8 +14,9 @@ import pytest
 import illumgrid as ig
 from illumgrid import registry
 from illumgrid.errors import IllumgridWarning
-from illumgrid.scene import Field, Material, Scene, box_around
-from illumgrid.volume import Volume
+from illumgrid.field.scene import Field, Material, Scene, box_around
+from illumgrid.field.volume import Volume
+from illumgrid.transport.samples import join_queries
 from shapes import ball, refused, sampled
 
 SAMPLERS = sorted(e.name for e in registry.entries() if e.kind == "sampler" and e.package == "illumgrid")
@@ -194,7 +195,7 @@ def test_constant_data_are_refused_and_said_why():
 def test_tangent_rays_neither_stick_nor_leak():
     """Rays that graze a ball: nearer than its radius they hit, farther they pass, and on the rim they do either."""
     from illumgrid.backends.kernels import MISS, SURFACE, cast_rays
-    from illumgrid.levelset import marchable
+    from illumgrid.field.levelset import marchable
 
     squares = sampled(lambda x: -(x**2).sum(axis=1), (21, 21, 21), origin=(-10,) * 3)
     fields = marchable(Scene.sky(squares, range=(-36, -30)))
@@ -211,7 +212,7 @@ def test_coincident_samples_count_once():
     scene = sky(ball(9), (0.3, 0.9))
     spec = ig.GridSpec.over(scene.fields[0].volume, 9)
     asked = ig.Queries.at(scene, spec.nodes(), level=None)
-    twice = ig.samples.join_queries([asked, replace(asked, id=asked.id + np.uint64(1 << 20))])
+    twice = join_queries([asked, replace(asked, id=asked.id + np.uint64(1 << 20))])
     answer = ig.backend("numba").solve(scene, twice, paths=range(8), bounces=1, seed=0)
     for name in INTERPOLATORS:
         grid = ig.interpolator(name).fill(answer, spec, 0)

@@ -7,11 +7,11 @@ import numpy as np
 import OpenEXR
 import pytest
 
-from illumgrid import store
 from illumgrid.errors import BadInput
+from illumgrid.field.scene import Field, Levels, Material, Quad, Scene
+from illumgrid.field.volume import Volume
 from illumgrid.grid import GridSpec, IlluminationGrid, WallTexture
-from illumgrid.scene import Field, Levels, Material, Quad, Scene
-from illumgrid.volume import Volume
+from illumgrid.io import store
 
 MIRRORED = ((0, 0, -1), (1, 0, 0), (0, 1, 0))
 ODD = np.array([0.0, -0.0, 1e-42, np.inf, 3.4e38, 1 / 3, np.nan], np.float32)

@@ -9,8 +9,8 @@ import numpy as np
 import OpenEXR
 import pytest
 
-from illumgrid import store
 from illumgrid.errors import BadInput
+from illumgrid.io import store
 from test_store import assert_same, example
 
 

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from illumgrid import store
 from illumgrid.errors import BadInput
+from illumgrid.io import store
 from test_store import assert_same, example, left_beside
 
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from illumgrid.preview import BACKGROUND, CAP_TONE, fit_camera, png, render
-from illumgrid.scene import Field, Material, Scene
+from illumgrid.field.scene import Field, Material, Scene
+from illumgrid.field.volume import Volume
+from illumgrid.show.render import BACKGROUND, CAP_TONE, fit_camera, png, render
 from illumgrid.tone import WHITE, automatic_exposure, encode_srgb
-from illumgrid.volume import Volume
 from shapes import lit, sampled, sky
 
 GROUND = encode_srgb(np.full(3, BACKGROUND))

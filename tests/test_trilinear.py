@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
 
+from illumgrid.field.volume import ON_A_VOXEL, index_to_world, world_to_index
 from illumgrid.grid import GridSpec, read_lattice
-from illumgrid.volume import ON_A_VOXEL, index_to_world, world_to_index
 from shapes import DIRECTIONS
 
 pytestmark = pytest.mark.plain

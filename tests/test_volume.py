@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from illumgrid.errors import IllumgridWarning
-from illumgrid.volume import (
+from illumgrid.field.volume import (
     Volume,
     cell_gradient,
     cells,

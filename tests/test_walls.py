@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 
 import illumgrid as ig
-from illumgrid import store
 from illumgrid.backends.numba_ import Numba
 from illumgrid.bake import bake, texel_paths, wall_queries
 from illumgrid.errors import BadInput
+from illumgrid.field.scene import Field, Material, Quad, Scene, level_table
 from illumgrid.grid import GridSpec, WallTexture
 from illumgrid.interpolators.nearest import Nearest
-from illumgrid.preview import fit_camera, render
+from illumgrid.io import store
 from illumgrid.samplers.direct import Direct
-from illumgrid.scene import Field, Material, Quad, Scene, level_table
+from illumgrid.show.render import fit_camera, render
 from shapes import ball, lit
 from test_store import assert_same, example
 from transport import waves

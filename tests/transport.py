@@ -5,10 +5,10 @@ from statistics import NormalDist
 
 import numpy as np
 
-from illumgrid.samples import Queries, join_queries
-from illumgrid.scene import Field, Material, Scene
+from illumgrid.field.scene import Field, Material, Scene
+from illumgrid.field.volume import Volume
 from illumgrid.stages import on_level_sets
-from illumgrid.volume import Volume
+from illumgrid.transport.samples import Queries, join_queries
 
 ALBEDO = np.array([0.8, 0.5, 0.2])
 EMISSION = np.array([0.05, 0.3, 0.7])

@@ -8,7 +8,7 @@ import pytest
 import SimpleITK as sitk  # noqa: N813
 
 from illumgrid.errors import BadInput
-from illumgrid.readers import read_volume
+from illumgrid.io.readers import read_volume
 
 ORIGIN, SPACING = (-3.0, 4.0, 10.5), (0.5, 1.25, 2.0)
 TURN = np.array([[0.8, -0.6, 0], [0.6, 0.8, 0], [0, 0, -1]])  # oblique, and mirrored

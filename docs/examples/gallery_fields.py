@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 
 import illumgrid as ig
-from illumgrid.demo import spread
-from illumgrid.volume import smooth
+from illumgrid.field.builtin import spread
+from illumgrid.field.volume import smooth
 
 HERE = Path.cwd()
 PLACES = [parent / "shared" / "volumes" for parent in (HERE, *HERE.parents[:5])]

@@ -13,8 +13,8 @@ nothing but the isovalue. ``illumgrid preview nucleus-light --sweep 24 nucleus.w
 import matplotlib.pyplot as plt
 
 import illumgrid as ig
-from illumgrid.demo import nucleus
-from illumgrid.preview import fit_camera, render, widest_row
+from illumgrid.field.builtin import nucleus
+from illumgrid.show.render import fit_camera, render, widest_row
 
 scene = nucleus()
 light = ig.run(scene, grid=28, paths=48, isovalues=5)

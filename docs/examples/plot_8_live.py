@@ -10,8 +10,8 @@ each isosurface is drawn by your graphics card. The page is one file of about a 
 from pathlib import Path
 
 import illumgrid as ig
-from illumgrid.demo import nucleus
-from illumgrid.viewer import page
+from illumgrid.field.builtin import nucleus
+from illumgrid.show.viewer import page
 
 light = ig.run(nucleus(), grid=28, paths=96, isovalues=5)
 

@@ -9,15 +9,16 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from illumgrid.chain import load, run
     from illumgrid.errors import BadInput, IllumgridWarning
+    from illumgrid.field.levelset import isosurface
+    from illumgrid.field.scene import Field, Levels, Material, Quad, Scene, suggest_range
+    from illumgrid.field.volume import Volume
     from illumgrid.grid import GridSpec, IlluminationGrid, WallTexture
-    from illumgrid.illumination import Illumination, load, run
-    from illumgrid.levelset import isosurface
-    from illumgrid.readers import read_scene, read_volume
+    from illumgrid.io.readers import read_scene, read_volume
+    from illumgrid.light import Illumination
     from illumgrid.registry import backend, interpolator, sampler
-    from illumgrid.samples import Queries, Samples
-    from illumgrid.scene import Field, Levels, Material, Quad, Scene, suggest_range
-    from illumgrid.volume import Volume
+    from illumgrid.transport.samples import Queries, Samples
 
 __all__ = [
     "BadInput",
@@ -46,15 +47,16 @@ __all__ = [
 ]
 
 _HOMES = {
+    "chain": ("load", "run"),
     "errors": ("BadInput", "IllumgridWarning"),
+    "field.levelset": ("isosurface",),
+    "field.scene": ("Field", "Levels", "Material", "Quad", "Scene", "suggest_range"),
+    "field.volume": ("Volume",),
     "grid": ("GridSpec", "IlluminationGrid", "WallTexture"),
-    "illumination": ("Illumination", "load", "run"),
-    "levelset": ("isosurface",),
-    "readers": ("read_scene", "read_volume"),
+    "io.readers": ("read_scene", "read_volume"),
+    "light": ("Illumination",),
     "registry": ("backend", "interpolator", "sampler"),
-    "samples": ("Queries", "Samples"),
-    "scene": ("Field", "Levels", "Material", "Quad", "Scene", "suggest_range"),
-    "volume": ("Volume",),
+    "transport.samples": ("Queries", "Samples"),
 }
 _HOME = {name: home for home, names in _HOMES.items() for name in names}
 

@@ -8,12 +8,12 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from illumgrid.field.scene import Levels, Quad, Scene
+from illumgrid.field.volume import interpolate, world_to_index
 from illumgrid.grid import GridSpec, IlluminationGrid, WallTexture, fill_holes
 from illumgrid.samplers.direct import Direct, reachable
-from illumgrid.samples import Queries, Samples, combine, join_queries, join_samples
-from illumgrid.scene import Levels, Quad, Scene
 from illumgrid.stages import Backend, Interpolator, Sampler
-from illumgrid.volume import interpolate, world_to_index
+from illumgrid.transport.samples import Queries, Samples, combine, join_queries, join_samples
 
 Progress = Callable[[str, int, int], None]
 """Called with what is being done, how much of it is done, and how much there is."""

@@ -1,25 +1,19 @@
-"""The three stages that can be exchanged, and all that their authors need.
+"""All that the author of a stage imports: the Protocols, the hooks, and the types that they speak of."""
 
-A stage is a frozen dataclass with a class attribute ``name``; its fields are its options, each with a default, of type
-bool, int, float, str, a ``Literal`` of words, or a tuple of numbers. It may have a class method ``available``, which
-returns None where the stage can run, and else what would make it so, such as ``"pip install embreex"``.
-
-A package brings stages by hooks, functions marked with `hookimpl`, in a module that its entry point of the group
-``illumgrid`` names.
-"""
-
-from collections.abc import Iterable, Iterator, Sequence
-from typing import ClassVar, Literal, Protocol, runtime_checkable
-
-import numpy as np
-import pluggy
-from numpy.typing import ArrayLike
-
-from illumgrid.errors import BadInput
-from illumgrid.grid import GridSpec, IlluminationGrid
-from illumgrid.levelset import isosurface
-from illumgrid.samples import Queries, Samples
-from illumgrid.scene import Scene
+from illumgrid.transport.stages import (
+    Backend,
+    GridSpec,
+    IlluminationGrid,
+    Interpolator,
+    Queries,
+    Sampler,
+    Samples,
+    hookimpl,
+    on_level_sets,
+    register_backends,
+    register_interpolators,
+    register_samplers,
+)
 
 __all__ = [
     "Backend",
@@ -31,140 +25,7 @@ __all__ = [
     "Samples",
     "hookimpl",
     "on_level_sets",
+    "register_backends",
+    "register_interpolators",
+    "register_samplers",
 ]
-
-hookimpl = pluggy.HookimplMarker("illumgrid")
-"""Marks a function as one of the hooks below; the function's name says which."""
-
-_hookspec = pluggy.HookspecMarker("illumgrid")
-
-
-@runtime_checkable
-class Sampler(Protocol):
-    """Where to ask for light."""
-
-    name: ClassVar[str]
-
-    def queries(self, scene: Scene, specs: Sequence[GridSpec], seed: int) -> Iterable[Queries]:
-        """Yield batches of queries on the level sets of every field, ids unique over all batches.
-
-        Parameters
-        ----------
-        scene : Scene
-        specs : sequence of GridSpec
-            The nodes to be filled, one lattice a field.
-        seed : int
-            Equal seeds give equal queries.
-        """
-
-
-@runtime_checkable
-class Backend(Protocol):
-    """Light transport: answers the questions.
-
-    A backend that answers with something other than light, such as a share of the sky that is not hidden, says so by a
-    class attribute ``transport = False``: closed forms of light are then no measure of it.
-    """
-
-    name: ClassVar[str]
-    geometry: ClassVar[Literal["mesh", "levelset", "both"]]
-
-    def solve(self, scene: Scene, queries: Queries, *, paths: range, bounces: int, seed: int) -> Samples:
-        """Trace the paths with these numbers from every query.
-
-        The answer to a query depends on its id, `paths`, `bounces` and `seed`, never on the batch it came in.
-
-        Parameters
-        ----------
-        scene : Scene
-        queries : Queries
-            A query without a normal, or inside another field's solid, is a hole: paths 0.
-        paths : range
-            Numbers of the paths, step 1; disjoint ranges combine.
-        bounces : int
-            Reflections: 0 is light straight from background and lamps.
-        seed : int
-        """
-
-
-@runtime_checkable
-class Interpolator(Protocol):
-    """From scattered answers to a uniform grid."""
-
-    name: ClassVar[str]
-
-    def fill(self, samples: Samples, spec: GridSpec, field: int) -> IlluminationGrid:
-        """Fill every node from the samples of one field.
-
-        Parameters
-        ----------
-        samples : Samples
-            All of them on level sets of field number `field`; holes (paths 0) among them.
-        spec : GridSpec
-        field : int
-        """
-
-
-@_hookspec
-def register_samplers() -> Sequence[type[Sampler]]:  # type: ignore[empty-body]
-    """Sampler classes of a package."""
-
-
-@_hookspec
-def register_backends() -> Sequence[type[Backend]]:  # type: ignore[empty-body]
-    """Backend classes of a package."""
-
-
-@_hookspec
-def register_interpolators() -> Sequence[type[Interpolator]]:  # type: ignore[empty-body]
-    """Interpolator classes of a package."""
-
-
-def on_level_sets(
-    scene: Scene,
-    levels: ArrayLike,
-    seed: int,
-    *,
-    specs: Sequence[GridSpec] | None = None,
-    points: int | None = None,
-) -> Iterator[Queries]:
-    """Queries on every field's level set of each row of `levels`, uniform by area, projected on the trilinear set.
-
-    Parameters
-    ----------
-    scene : Scene
-    levels : (K,) or (K, F) array_like
-        Isovalues of field 0 (the other fields follow the common sweep), or whole rows.
-    seed : int
-        Equal seeds give equal points.
-    specs : sequence of GridSpec, optional
-        One a field: their node spacing sets the default number of points; without it the voxel spacing does.
-    points : int, optional
-        Points on each level set; by default one for each squared spacing, at least 64.
-
-    Yields
-    ------
-    Queries
-        One batch for each row and field whose level set is not empty; ids count up within a field, over all rows.
-    """
-    rows = np.asarray(levels, dtype=float)
-    if rows.ndim == 1:
-        rows = scene.levels_through(0, rows)
-    if rows.ndim != 2 or rows.shape[1] != len(scene.fields) or not np.isfinite(rows).all():
-        raise BadInput(f"levels have shape {rows.shape}; expected (K,) or (K, {len(scene.fields)}) finite isovalues")
-    asked = np.zeros(len(scene.fields), dtype=np.int64)
-    for number, row in enumerate(rows):
-        for f, field in enumerate(scene.fields):
-            mesh = isosurface(field.volume, row[f], field.inside)
-            if not len(mesh.faces) or not mesh.area > 0:
-                continue
-            spacing = (field.volume if specs is None else specs[f]).spacing
-            count = points or max(64, round(mesh.area / float(np.prod(spacing) ** (2 / 3))))
-            random = np.random.default_rng((seed, number, f))
-            corners = mesh.triangles[random.choice(len(mesh.faces), count, p=mesh.area_faces / mesh.area)]
-            # Uniform in a triangle: Osada et al., "Shape distributions", ACM TOG 21(4), 2002.
-            root, share = np.sqrt(random.random((count, 1))), random.random((count, 1))
-            at = (1 - root) * corners[:, 0] + root * (1 - share) * corners[:, 1] + root * share * corners[:, 2]
-            queries = Queries.at(scene, at, field=f, level=row[f], first_id=(f << 40) + int(asked[f]))
-            asked[f] += count
-            yield Queries(queries.id, queries.point, queries.normal, np.tile(row, (count, 1)), queries.target)

@@ -12,14 +12,14 @@ from typing import Any, ClassVar, cast
 
 import numpy as np
 
-from illumgrid.analytic import CASES, on_quad
+from illumgrid.accuracy.verify import applies, judge, line, sidak
+from illumgrid.field.scene import Field, Material, Quad, Scene
+from illumgrid.field.volume import Floats, Volume, interpolate, outward_normals, world_to_index
 from illumgrid.grid import GridSpec, IlluminationGrid
-from illumgrid.options import expected, options
-from illumgrid.samples import Queries, Samples, combine, join_queries
-from illumgrid.scene import Field, Material, Quad, Scene
+from illumgrid.registry.options import expected, options
 from illumgrid.stages import on_level_sets
-from illumgrid.verify import applies, judge, line, sidak
-from illumgrid.volume import Floats, Volume, interpolate, outward_normals, world_to_index
+from illumgrid.transport.analytic import CASES, on_quad
+from illumgrid.transport.samples import Queries, Samples, combine, join_queries
 
 __all__ = ["BackendTests", "InterpolatorTests", "SamplerTests"]
 
@@ -253,7 +253,7 @@ class BackendTests(_StageTests):
         assert ratio <= most, f"the median bar is {ratio:.2f} times the true error; expected at most {most:.2f}"
 
     def test_light_is_as_its_closed_forms_say(self) -> None:
-        """Scenes whose light is known, for surfaces that are level sets or their meshes: see `illumgrid.analytic`."""
+        """Scenes whose light is known, for surfaces that are level sets or their meshes: see `transport.analytic`."""
         stage = self.make()
         if not getattr(stage, "transport", True):
             raise unittest.SkipTest("the backend says that it is no light transport")

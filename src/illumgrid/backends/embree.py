@@ -29,12 +29,11 @@ from illumgrid.backends.reference import (
     gradient_normal,
 )
 from illumgrid.errors import BadInput
-from illumgrid.levelset import in_frame
+from illumgrid.field.scene import Scene
+from illumgrid.field.volume import Floats
 from illumgrid.rng import stream
-from illumgrid.samples import Queries, Samples, in_turn
-from illumgrid.scene import Scene
 from illumgrid.stages import Backend, hookimpl
-from illumgrid.volume import Floats
+from illumgrid.transport.samples import Queries, Samples, in_frame, in_turn
 
 Cast = Callable[[int, Floats, Floats], tuple[Floats, Ints]]
 """First face of field f's mesh along frame rays (n, 3): distance and number in that mesh, each (n,); inf, -1: none."""

@@ -4,7 +4,7 @@ It lives in this one file, with `bvh` and `lanes` below it, because Numba's disk
 (`lanes.cached` names the two); what else it imports is frozen. Kernels are serial, release the GIL and depend on
 nothing but their arguments; threads are the caller's business.
 
-Two surfaces stand for a level set. A scene that is `illumgrid.levelset.Marchable` is marched; one that is
+Two surfaces stand for a level set. A scene that is `illumgrid.field.levelset.Marchable` is marched; one that is
 `illumgrid.backends.meshes.Meshed` has a closed mesh for each field. The path loop is the same: the four questions that
 differ are asked through `either`, and only what a scene's type asks for is compiled.
 
@@ -20,7 +20,7 @@ from numba.extending import overload, register_jitable
 from illumgrid.backends import bvh, lanes
 from illumgrid.backends.bvh import View, cast
 from illumgrid.backends.lanes import address, at_least, cached, count_below
-from illumgrid.levelset import Marchable
+from illumgrid.field.levelset import Marchable
 from illumgrid.rng import draw, draw_pair, mix, net_size, pascal, reverse, sharing, stream, upward
 
 for _function in (mix, stream, draw, reverse, pascal, upward, draw_pair, net_size, sharing):
@@ -34,10 +34,10 @@ jit = cached(lanes, bvh, _nrt=False)
 inlined = cached(lanes, bvh, _nrt=False, forceinline=True)
 
 MISS, SURFACE, CAP, BURIED, QUAD = 0, 1, 2, 3, 4  # a ray meets nothing, a level set, a cap, a solid's inside, a quad
-BRICK_SHIFT = 2  # bricks of 4 cells a side, as in illumgrid.bricks
-REACH = (1, 1, 2, 3, 4, 6, 8, 16, 1 << 20)  # bricks to leap, by how many cubes are empty, as in illumgrid.bricks
+BRICK_SHIFT = 2  # bricks of 4 cells a side, as in illumgrid.field.bricks
+REACH = (1, 1, 2, 3, 4, 6, 8, 16, 1 << 20)  # bricks to leap, by how many cubes are empty, as in illumgrid.field.bricks
 ONE = np.uint64(1)
-ON_A_VOXEL = 1e-7  # as in illumgrid.volume
+ON_A_VOXEL = 1e-7  # as in illumgrid.field.volume
 ON_A_WALL = 1e-10  # a wall reaches this share of its size farther, so that walls joined at an edge leave no gap
 # Sizes 128, 512, ... of nets whose boxes of four paths are no squares: two shapes come near one. Fewer paths than that
 # take a third shape, too, or their differences would be too few.
@@ -185,7 +185,7 @@ def cubic(values, corner, step_x, step_y, level, ex, ey, ez, dx, dy, dz):
 
 @inlined
 def rank_of(steps, level):
-    """Rank of a level among the steps of a field: see `illumgrid.bricks`."""
+    """Rank of a level among the steps of a field: see `illumgrid.field.bricks`."""
     low, high = 0, steps.shape[0]
     while low < high:
         middle = (low + high) >> 1
@@ -206,7 +206,7 @@ def follow(u, t, d, low, high):
 def march(scene, f, level, ux, uy, uz, dx, dy, dz, on_surface, limit):
     """First meeting of a ray with the solid of field f, in index coordinates u + t d.
 
-    Bytes are compared first: see `illumgrid.bricks`. The ray leaps over the largest cube of bricks ahead that ranks
+    Bytes are compared first: see `field.bricks`. The ray leaps over the largest cube of bricks ahead that ranks
     below the level. A brick that does not is crossed at once too if no cell between the ray's two ends in it ranks high
     enough; else the ray goes from cell to cell (Amanatides & Woo 1987) and asks the cubic in such cells only.
     `on_surface`: the ray starts on the level set itself, outside. Returns (t, what, face), face the axis of a cap.

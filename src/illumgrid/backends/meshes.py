@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from illumgrid.backends import bvh
 from illumgrid.errors import BadInput
-from illumgrid.levelset import Marchable, extract, marchable
-from illumgrid.scene import Field, Scene
-from illumgrid.volume import Floats, Side, Volume
+from illumgrid.field.levelset import Marchable, extract, marchable
+from illumgrid.field.scene import Field, Scene
+from illumgrid.field.volume import Floats, Side, Volume
 
 SAME_LEVEL = 1e-6
 """Levels that this share of a field's range rounds to the same number share a mesh."""

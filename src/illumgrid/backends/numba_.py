@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from illumgrid.errors import BadInput
-from illumgrid.levelset import in_frame, marchable
-from illumgrid.samples import Queries, Samples, in_turn
-from illumgrid.scene import Scene
+from illumgrid.field.levelset import marchable
+from illumgrid.field.scene import Scene
 from illumgrid.stages import Backend, hookimpl
+from illumgrid.transport.samples import Queries, Samples, in_frame, in_turn
 
 Rows = slice | NDArray[np.int64]
 

@@ -11,12 +11,12 @@ from typing import ClassVar, Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from illumgrid.levelset import Marchable, in_frame, marchable
+from illumgrid.field.levelset import Marchable, marchable
+from illumgrid.field.scene import Scene
+from illumgrid.field.volume import ON_A_VOXEL, Floats
 from illumgrid.rng import draw, draw_pair, net_size, sharing, stream
-from illumgrid.samples import Queries, Samples, in_turn
-from illumgrid.scene import Scene
 from illumgrid.stages import Backend, hookimpl
-from illumgrid.volume import ON_A_VOXEL, Floats
+from illumgrid.transport.samples import Queries, Samples, in_frame, in_turn
 
 Bools = NDArray[np.bool_]
 Ints = NDArray[np.int64]

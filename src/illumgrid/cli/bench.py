@@ -30,10 +30,10 @@ def bench(
 
     DIR then holds bench.json, bench.csv, chart.png and chart.svg.
     """
-    from illumgrid import bench as benches
-    from illumgrid import store
-    from illumgrid.bench import report
+    from illumgrid.accuracy import chart as benches
+    from illumgrid.accuracy.chart import report
     from illumgrid.cli.run import _input
+    from illumgrid.io import store
 
     given = _input(source, None, limits, None, None)
     folder = output or Path(f"{given.name}-bench")

@@ -32,8 +32,8 @@ def export(
     ] = None,
 ) -> None:
     """Write the light of a finished run for another program."""
-    from illumgrid import exports, store
-    from illumgrid.illumination import load
+    from illumgrid.chain import load
+    from illumgrid.io import exports, store
 
     exports.check(file, isovalue, on, array)
     own = folder / store.EXR

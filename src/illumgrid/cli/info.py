@@ -7,9 +7,9 @@ import typer
 from illumgrid.cli.told import Ignore, heard, told_left_out
 
 if TYPE_CHECKING:
+    from illumgrid.field.scene import Quad
+    from illumgrid.field.volume import Side, Volume
     from illumgrid.grid import WallTexture
-    from illumgrid.scene import Quad
-    from illumgrid.volume import Side, Volume
 
 BLOCKS = " ▁▂▃▄▅▆▇█"
 
@@ -38,8 +38,8 @@ def info(
     ignore: Ignore = None,
 ) -> None:
     """Tell what is inside a volume or a finished run, and what of a volume will make trouble."""
-    from illumgrid import store
     from illumgrid.errors import BadInput
+    from illumgrid.io import store
 
     if inside not in (None, "above", "below"):
         raise BadInput(f"--inside is {inside!r}; expected above or below")
@@ -53,12 +53,12 @@ def info(
 
 
 def _told_volume(source: str, limits: tuple[float, float] | None, inside: "Side") -> None:
-    from illumgrid.diagnosis import critical_isovalues, diagnose, plateaus
     from illumgrid.errors import tell
-    from illumgrid.illumination import nodes_over
-    from illumgrid.readers import read_volume, volume_name
-    from illumgrid.scene import Field, suggest_range
-    from illumgrid.volume import finite
+    from illumgrid.field.diagnosis import critical_isovalues, diagnose, plateaus
+    from illumgrid.field.lattice import nodes_over
+    from illumgrid.field.scene import Field, suggest_range
+    from illumgrid.field.volume import finite
+    from illumgrid.io.readers import read_volume, volume_name
 
     volume = finite(read_volume(source), inside)
     _told_lattice(volume_name(source), volume)
@@ -102,7 +102,7 @@ def _told_lattice(name: str, volume: "Volume") -> None:
 
 
 def _told_run(source: str) -> None:
-    from illumgrid.illumination import load
+    from illumgrid.chain import load
 
     light = load(source)
     for field, grid in zip(light.scene.fields, light.grids):

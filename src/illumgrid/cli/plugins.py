@@ -32,7 +32,7 @@ def plugins() -> None:
 
 
 def _lines(entry: "Entry") -> Iterator[str]:
-    from illumgrid.options import options, short
+    from illumgrid.registry.options import options, short
 
     cure = entry.missing()
     state = "" if cure is None else f"; not available here: {cure}"

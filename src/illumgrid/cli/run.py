@@ -13,10 +13,10 @@ from illumgrid.cli.told import Ignore, heard, say, told_left_out, told_progress
 from illumgrid.errors import BadInput, tell
 
 if TYPE_CHECKING:
-    from illumgrid.demo import Preset
-    from illumgrid.illumination import Illumination
-    from illumgrid.scene import Scene
-    from illumgrid.volume import Side
+    from illumgrid.field.builtin import Preset
+    from illumgrid.field.scene import Scene
+    from illumgrid.field.volume import Side
+    from illumgrid.light import Illumination
 
 
 def _given(**options: Any) -> str:
@@ -41,8 +41,8 @@ def _input(
     albedo: tuple[float, float, float] | None,
 ) -> Input:
     """Tell a volume file from a scene file and a built-in scene; nothing is read yet."""
-    from illumgrid.demo import SCENES
-    from illumgrid.readers import volume_name
+    from illumgrid.field.builtin import SCENES
+    from illumgrid.io.readers import volume_name
 
     name = "nucleus" if source is None else source
     preset = SCENES.get(name) if source is None or not Path(source).exists() else None
@@ -61,23 +61,23 @@ def _input(
 
 
 def _scene_file(name: str) -> Input:
-    from illumgrid.readers import read_scene
+    from illumgrid.io.readers import read_scene
 
     return Input(Path(name).stem, lambda smooth: read_scene(name, smoothing=smooth))
 
 
 def _volume_scene(source: str, surroundings: str, albedo: Any, limits: Any, inside: "Side", smooth: float) -> "Scene":
-    from illumgrid.readers import read_volume, volume_name
-    from illumgrid.scene import Scene
-    from illumgrid.volume import finite
-    from illumgrid.volume import smooth as blur
+    from illumgrid.field.scene import Scene
+    from illumgrid.field.volume import finite
+    from illumgrid.field.volume import smooth as blur
+    from illumgrid.io.readers import read_volume, volume_name
 
     around = {"sky": Scene.sky, "floor": Scene.floor, "box": Scene.box}[surroundings]
     return around(blur(finite(read_volume(source), inside), smooth), albedo, limits, inside, volume_name(source))
 
 
 def _smoothed(make: Callable[[], "Scene"], smooth: float) -> "Scene":
-    from illumgrid.volume import smooth as blur
+    from illumgrid.field.volume import smooth as blur
 
     scene = make()
     return replace(scene, fields=tuple(replace(f, volume=blur(f.volume, smooth)) for f in scene.fields))
@@ -182,10 +182,10 @@ def run(
     DIR then holds illumination.exr, run.json and preview.png, and needs nothing else.
     """
     begun = time.perf_counter()
-    from illumgrid import store
-    from illumgrid.diagnosis import diagnose
-    from illumgrid.illumination import nodes_over
-    from illumgrid.illumination import run as light_up
+    from illumgrid.chain import run as light_up
+    from illumgrid.field.diagnosis import diagnose
+    from illumgrid.field.lattice import nodes_over
+    from illumgrid.io import store
 
     with heard(ignore) as sentences:
         names = {"sampler": sampler, "backend": backend, "interpolator": interpolator}
@@ -231,7 +231,7 @@ def _why_auto() -> str:
 def _judged(light: "Illumination", backend: Any, seed: int) -> "Illumination":
     """With the error that was reached, where the backend can tell it at points that each have a level set."""
     from illumgrid import registry
-    from illumgrid.plan import judge
+    from illumgrid.accuracy.choose import judge
 
     if light.recipe.get("reached") or backend.geometry == "mesh":
         return light
@@ -242,7 +242,7 @@ def _judged(light: "Illumination", backend: Any, seed: int) -> "Illumination":
 
 def _told_help(light: "Illumination", stages: dict[str, Any]) -> None:
     """Where more paths would not help much, what would."""
-    from illumgrid.plan import helps
+    from illumgrid.accuracy.choose import helps
 
     recipe = light.recipe
     if (stages["sampler"].name, stages["interpolator"].name) != ("direct", "nearest") or not recipe.get("reached"):

@@ -20,7 +20,7 @@ def verify(
     z is the mean difference over the queries in units of its standard error and of a derived bound on what the cells of
     the surface do; max |z| is that of a single query.
     """
-    from illumgrid.verify import HEADER, check, line
+    from illumgrid.accuracy.verify import HEADER, check, line
 
     typer.echo(HEADER)
     rows = []

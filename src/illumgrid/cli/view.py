@@ -20,8 +20,8 @@ def view(
     ] = False,
 ) -> None:
     """Sweep the isovalue by hand: in the browser, in a file to mail, or in a window."""
-    from illumgrid import store
-    from illumgrid.illumination import load
+    from illumgrid.chain import load
+    from illumgrid.io import store
 
     if export is not None and export.suffix.lower() not in (".html", ".htm"):
         raise BadInput(f"--export is {export.name!r}; expected a file name that ends in .html")
@@ -29,18 +29,18 @@ def view(
         raise BadInput("--desktop came with --export or --no-open; expected one of the three")
     light = load(folder)
     if desktop:
-        from illumgrid.viewer.desktop import show
+        from illumgrid.show.viewer.desktop import show
 
         show(light)
         return
-    from illumgrid.viewer import page
+    from illumgrid.show.viewer import page
 
     text = page(light).encode()
     if export is not None:
         store.write_file(export, text)
         say(f"wrote {export}, {len(text) / 1e6:.1f} MB: open it in any browser, or mail it")
         return
-    from illumgrid.viewer.server import serve
+    from illumgrid.show.viewer.server import serve
 
     with serve(text) as server:
         say(f"serving {server.address} to this machine only; Ctrl-C ends it")

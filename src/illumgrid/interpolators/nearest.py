@@ -7,8 +7,8 @@ import numpy as np
 
 from illumgrid.grid import GridSpec, IlluminationGrid, fill_holes
 from illumgrid.interpolators.neighbours import diagonal, near_samples
-from illumgrid.samples import Samples
 from illumgrid.stages import Interpolator, hookimpl
+from illumgrid.transport.samples import Samples
 
 _SLAB = 1 << 18  # nodes asked at once: bounds the memory of a search
 

@@ -7,9 +7,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from illumgrid.field.volume import Floats, world_to_index
 from illumgrid.grid import GridSpec, IlluminationGrid, fill_holes
-from illumgrid.samples import Samples
-from illumgrid.volume import Floats, world_to_index
+from illumgrid.transport.samples import Samples
 
 _SLAB = 1 << 16  # nodes asked at once: bounds the memory of a search
 _ONE_PLACE = 1e-6  # of a node spacing: samples so close are one

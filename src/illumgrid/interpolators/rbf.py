@@ -7,11 +7,11 @@ from typing import ClassVar
 import numpy as np
 
 from illumgrid.errors import BadInput
+from illumgrid.field.volume import Floats
 from illumgrid.grid import GridSpec, IlluminationGrid
 from illumgrid.interpolators.neighbours import Neighbours, Sites, filled
-from illumgrid.samples import Samples
 from illumgrid.stages import Interpolator, hookimpl
-from illumgrid.volume import Floats
+from illumgrid.transport.samples import Samples
 
 
 def _spline_values(places: Sites, around: Neighbours) -> tuple[Floats, Floats]:

@@ -6,11 +6,11 @@ from typing import ClassVar
 import numpy as np
 
 from illumgrid.errors import BadInput
+from illumgrid.field.volume import Floats
 from illumgrid.grid import GridSpec, IlluminationGrid
 from illumgrid.interpolators.neighbours import Neighbours, Sites, filled
-from illumgrid.samples import Samples
 from illumgrid.stages import Interpolator, hookimpl
-from illumgrid.volume import Floats
+from illumgrid.transport.samples import Samples
 
 
 def _kernel_means(places: Sites, around: Neighbours) -> tuple[Floats, Floats]:

@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from illumgrid.errors import BadInput
+from illumgrid.field.scene import Field, Scene, level_table
+from illumgrid.field.volume import Floats
 from illumgrid.grid import GridSpec
-from illumgrid.samples import Queries
-from illumgrid.scene import Field, Scene, level_table
 from illumgrid.stages import Sampler, hookimpl, on_level_sets
-from illumgrid.volume import Floats
+from illumgrid.transport.samples import Queries
 
 _BINS = 1024  # of the sweep: a field of bytes has a quarter of that many isovalues
 _CELLS = 1 << 18  # measured at once: bounds the memory

@@ -10,11 +10,11 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from illumgrid.field.scene import Field, Scene
+from illumgrid.field.volume import index_to_world, interpolate, project, world_to_index
 from illumgrid.grid import GridSpec
-from illumgrid.samples import Queries
-from illumgrid.scene import Field, Scene
 from illumgrid.stages import Sampler, hookimpl
-from illumgrid.volume import index_to_world, interpolate, project, world_to_index
+from illumgrid.transport.samples import Queries
 
 _BATCH = 1 << 14
 

@@ -5,10 +5,10 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from illumgrid.errors import BadInput
+from illumgrid.field.scene import Scene, level_table
 from illumgrid.grid import GridSpec
-from illumgrid.samples import Queries
-from illumgrid.scene import Scene, level_table
 from illumgrid.stages import Sampler, hookimpl, on_level_sets
+from illumgrid.transport.samples import Queries
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,1 @@
+"""How far off a grid is, and what it costs."""

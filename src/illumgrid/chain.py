@@ -1,0 +1,178 @@
+"""From a scene to its light, and from a folder: where names of stages become objects."""
+
+import os
+import time
+from collections.abc import Iterable
+from dataclasses import asdict
+from importlib.metadata import version
+from typing import Any
+
+import numpy as np
+
+from illumgrid import registry
+from illumgrid.accuracy.choose import judge, planned, rounds
+from illumgrid.bake import Map, Progress, bake, enough_bounces, light_left_out
+from illumgrid.constants import PATHS
+from illumgrid.errors import BadInput, tell
+from illumgrid.field.lattice import nodes_over
+from illumgrid.field.scene import Scene, level_table
+from illumgrid.grid import IlluminationGrid
+from illumgrid.io import store
+from illumgrid.light import Illumination
+from illumgrid.stages import Backend, Interpolator, Sampler
+
+
+def load(folder: str | os.PathLike[str]) -> Illumination:
+    """Read what `Illumination.save` or ``illumgrid run`` wrote."""
+    stored = store.read(folder)
+    return Illumination(stored.scene, stored.levels, stored.grids, stored.walls, stored.recipe)
+
+
+def _stage(kind: str, given: Any, options: dict[str, Any] | None = None) -> Any:
+    return registry.make(kind, given, options or {}) if isinstance(given, str) else given
+
+
+def _described(stage: Any) -> dict[str, Any]:
+    return {"name": stage.name, **asdict(stage)}
+
+
+def run(
+    scene: Scene,
+    *,
+    sampler: str | Sampler = "direct",
+    backend: str | Backend = "auto",
+    interpolator: str | Interpolator = "nearest",
+    grid: int | None = None,
+    paths: int | None = None,
+    bounces: int | None = None,
+    isovalues: int | None = None,
+    seed: int = 0,
+    error: float | None = None,
+    seconds: float | None = None,
+    map: Map = map,
+    progress: Progress = lambda what, done, total: None,
+) -> Illumination:
+    """Light a scene: one illumination grid for each field.
+
+    Parameters
+    ----------
+    scene : Scene
+    sampler, backend, interpolator : str or stage
+        Names, or stage objects such as ``illumgrid.sampler("uniform", count=64)``.
+    grid : int, optional
+        Nodes along the axis with most voxels; by default 1.2 for each voxel, at most 150.
+    paths : int, optional
+        Light paths from every query; by default 32.
+    bounces : int, optional
+        Reflections; 0 is light straight from background and lamps. By default as many as leave out less than 1 % of
+        the light, and at least 4.
+    isovalues : int, optional
+        Rows of the level table, 32 by default; if given, also the count of a sampler that is named and has one.
+    seed : int
+        Equal seeds give bit-identical grids, on any number of threads.
+    error : float, optional
+        Relative root mean square error to reach: a short pilot chooses `grid`, `paths` and `bounces`, as far as they
+        are not given, for the least time. Needs the sampler `direct`, the interpolator `nearest` and a backend that
+        marches level sets, whose error is known before the grid is built.
+    seconds : float, optional
+        In place of `error`: time to use, for the least error.
+    map : callable, optional
+        What spreads the work: see `illumgrid.bake.bake`.
+    progress : callable, optional
+        Told (what, done, total).
+
+    Returns
+    -------
+    Illumination
+
+    Raises
+    ------
+    BadInput
+        On options out of range, or unknown names.
+
+    Warns
+    -----
+    IllumgridWarning
+        When nodes within the range are holes.
+    """
+    if paths is not None and not 1 <= paths < 2**31:
+        raise BadInput(f"{paths} paths were asked for; expected at least 1 and fewer than 2**31")
+    if bounces is not None and not 0 <= bounces < 2**31:
+        raise BadInput(f"{bounces} bounces were asked for; expected 0 (light straight from the lamps) to 2**31 - 1")
+    if not 0 <= seed < 2**64:
+        raise BadInput(f"the seed is {seed}; expected a whole number from 0 to 2**64 - 1")
+    levels = level_table(scene, 32 if isovalues is None else isovalues)
+    options = {}
+    if isovalues is not None and isinstance(sampler, str) and "count" in registry.option_names("sampler", sampler):
+        options["count"] = isovalues
+    chosen = _stage("sampler", sampler, options), _stage("backend", backend), _stage("interpolator", interpolator)
+    begun, plan = time.perf_counter(), None
+    walked: Iterable[range] = [range(PATHS if paths is None else paths)]
+    if error is not None or seconds is not None:
+        _check_plannable(error, seconds, *chosen)
+        progress("pilot", 0, 1)
+        plan = planned(
+            scene, chosen[1], levels, error=error, seconds=seconds, grid=grid, paths=paths, bounces=bounces, seed=seed
+        )
+        progress("pilot", 1, 1)
+        grid, bounces = plan.grid, plan.bounces
+        walked = [range(plan.paths)] if seconds is None or paths is not None else rounds(plan, begun + seconds)
+    specs = [nodes_over(field.volume, grid) for field in scene.fields]
+    if bounces is None:
+        bounces, left_out = enough_bounces(scene, chosen[1], seed)
+    else:
+        left_out = light_left_out(scene, chosen[1], bounces, seed)
+    baked = bake(scene, specs, levels, *chosen, paths=walked, bounces=bounces, seed=seed, map=map, progress=progress)
+    for field, holes in zip(scene.fields, baked.holes):
+        if holes:
+            tell(
+                "holes",
+                f"{holes} nodes within the range of field {field.name!r} got no light of their own (no normal, or no "
+                "sample in reach); they show that of the nearest node",
+                stacklevel=2,
+            )
+    reached = None
+    if plan is not None:
+        reached = judge(scene, chosen[1], baked.grids, seed, baked.queries, baked.paths, bounces)
+    recipe = {
+        **{kind: _described(stage) for kind, stage in zip(("sampler", "backend", "interpolator"), chosen)},
+        "grid": max(max(spec.shape) for spec in specs),
+        "paths": baked.paths,
+        "bounces": bounces,
+        "left_out": left_out,
+        "isovalues": len(levels.table),
+        "seed": seed,
+        "queries": baked.queries,
+        "holes": list(baked.holes),
+        "seconds": {stage: round(seconds, 3) for stage, seconds in baked.seconds.items()},
+        "relative_error": _relative_error(baked.grids),
+        "plan": None if plan is None else asdict(plan),
+        "reached": reached,
+        "versions": {name: version(name) for name in ("illumgrid", "numpy", "numba", "scipy")},
+    }
+    return Illumination(scene, levels, baked.grids, baked.walls, recipe)
+
+
+def _check_plannable(error: float | None, seconds: float | None, sampler: Any, backend: Any, interpolator: Any) -> None:
+    """Refuse what no pilot can plan for."""
+    if error is not None and seconds is not None:
+        raise BadInput("both an error and a time were asked for; expected one of them")
+    if error is not None and not 0 < error < 1:
+        raise BadInput(f"an error of {error:g} was asked for; expected a share of the mean light, such as 0.03")
+    if seconds is not None and not 0 < seconds < np.inf:
+        raise BadInput(f"{seconds:g} seconds were asked for; expected a positive number")
+    if (sampler.name, interpolator.name) != ("direct", "nearest") or backend.geometry == "mesh":
+        raise BadInput(
+            f"an error or a time was asked for with {sampler.name}, {backend.name} and {interpolator.name}; expected "
+            "direct, a backend that marches level sets, and nearest: 'illumgrid bench' measures the others"
+        )
+
+
+def _relative_error(grids: tuple[IlluminationGrid, ...]) -> list[float | None]:
+    """For each grid, root mean square standard error of its nodes over their mean irradiance; None below two paths."""
+    result: list[float | None] = []
+    for grid in grids:
+        known = np.isfinite(grid.error) & (grid.support > 0)
+        mean = float(grid.values[known].mean()) if known.any() else 0.0
+        result.append(float(np.sqrt(np.square(grid.error[known], dtype=float).mean())) / mean if mean > 0 else None)
+    return result

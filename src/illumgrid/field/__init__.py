@@ -1,0 +1,1 @@
+"""What is lit: volumes, scenes, level sets."""

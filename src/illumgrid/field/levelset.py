@@ -1,0 +1,190 @@
+"""A level set, as a mesh and as something to march through."""
+
+import weakref
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from illumgrid.errors import BadInput
+from illumgrid.field.bricks import Bricks, lay_bricks
+from illumgrid.field.scene import Scene
+from illumgrid.field.volume import Floats, Side, Volume, index_to_world
+
+if TYPE_CHECKING:
+    import trimesh
+
+
+def off_the_data(volume: Volume, isovalue: float, inside: Side) -> float:
+    """Nudge an isovalue that is also a data value by an ulp, towards the side that keeps the solid {h >= c} (or <=).
+
+    An extraction exactly at data values leaves duplicate faces and holes.
+    """
+    level = np.float32(isovalue)
+    if not (volume.values == level).any():
+        return float(isovalue)
+    return float(np.nextafter(level, np.float32(-np.inf if inside == "above" else np.inf)))
+
+
+def isosurface(volume: Volume, isovalue: float, inside: Side = "above", capped: bool = False) -> "trimesh.Trimesh":
+    """Mesh of the level set {h = isovalue}.
+
+    Parameters
+    ----------
+    volume : Volume
+    isovalue : float
+    inside : {"above", "below"}
+        Which side is solid; the faces look away from it.
+    capped : bool
+        Close the solid where it meets the border of the volume: the mesh is then watertight.
+
+    Returns
+    -------
+    trimesh.Trimesh
+        World units, normals towards the outside; empty when no voxel edge crosses the isovalue.
+
+    References
+    ----------
+    .. [1] T. Lewiner, H. Lopes, A. W. Vieira, G. Tavares, "Efficient implementation of marching cubes' cases with
+           topological guarantees", J. Graphics Tools 8(2), 2003 (scikit-image's ``marching_cubes``).
+    """
+    import trimesh
+
+    if not np.isfinite(isovalue):
+        raise BadInput(f"the isovalue is {isovalue}; expected a finite number")
+    if inside not in ("above", "below"):
+        raise BadInput(f"inside is {inside!r}; expected 'above' or 'below'")
+    index, faces = extract(volume, isovalue, inside, capped)
+    if np.linalg.det(volume.direction) < 0:
+        faces = faces[:, ::-1]
+    return trimesh.Trimesh(index_to_world(volume, index), faces, process=False)
+
+
+def extract(volume: Volume, isovalue: float, inside: Side, capped: bool) -> tuple[Floats, NDArray[np.int64]]:
+    """Vertices (k, 3) in index coordinates and faces (m, 3) of a level set: see `isosurface`.
+
+    Faces are counterclockwise from outside in a right-handed picture of the index axes.
+    """
+    from skimage.measure import marching_cubes
+
+    level = off_the_data(volume, isovalue, inside)
+    values = volume.values.copy()  # the extraction wants a writeable buffer
+    if capped:
+        spread = max(float(np.ptp(values)), abs(level), 1e-30)
+        beyond = min(values.min(), level) - spread if inside == "above" else max(values.max(), level) + spread
+        values = np.pad(values, 1, constant_values=np.float32(beyond))
+    if not values.min() < level < values.max():
+        return np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64)
+    # scikit-image adds 2e-16 to every difference: scale by a power of two, or tiny fields are all epsilon.
+    exponent = int(np.frexp(float(values.max()) - float(values.min()))[1])
+    # It winds faces by the left hand: "ascent" turns them, by the right hand, away from what is higher.
+    index, faces, _, _ = marching_cubes(
+        np.ldexp(values, -exponent), float(np.ldexp(level, -exponent)),
+        gradient_direction="ascent" if inside == "above" else "descent",
+    )  # fmt: skip
+    index = index.astype(float) - (1.0 if capped else 0.0)
+    return np.clip(index, 0.0, np.array(volume.shape) - 1.0), faces.astype(np.int64)
+
+
+class Marchable(NamedTuple):
+    """All fields of a scene as flat arrays that a compiled kernel marches through, in the frame of the scene.
+
+    Every field is turned so that its solid is {v >= level}: for `inside` "below" v = -h and levels change sign too.
+    Their bricks serve every isovalue.
+    """
+
+    values: NDArray[np.float32]  # all fields, one after the other, C order
+    start: NDArray[np.int64]  # (F,) where each begins
+    shape: NDArray[np.int64]  # (F, 3) voxels
+    origin: Floats  # (F, 3) frame position of voxel 0
+    spacing: Floats  # (F, 3)
+    steps: NDArray[np.float32]  # (F, RANKS) as in `illumgrid.field.bricks`
+    bricks: NDArray[np.uint8]  # 128 bytes a brick, all fields, one after the other
+    brick_start: NDArray[np.int64]  # (F,) how many bricks come before
+    brick_shape: NDArray[np.int64]  # (F, 3)
+    albedo: Floats  # (F + Q, 3): fields, then quads
+    emission: Floats  # (F + Q, 3)
+    background: Floats  # (3,)
+    quad_corner: Floats  # (Q, 3) in the frame, as all that follows
+    quad_edges: Floats  # (Q, 2, 3)
+    quad_duals: Floats  # (Q, 2, 3): dot with a point from the corner gives its shares (0 to 1) along the edges
+    quad_normal: Floats  # (Q, 3) towards the front
+    quad_size: Floats  # (Q,) how large its edges are: rounding errors are a share of it
+    lamps: NDArray[np.int64]  # (L,) numbers of the quads that emit
+    lamp_share: Floats  # (L,) running sum of the probability to choose a lamp, in proportion to its power
+    lamp_density: Floats  # (Q,) probability to choose a point of the quad, per area; 0 if it does not emit
+    lamplight: Floats  # (3,) radiance of all lamps, were their power spread over a box around the scene
+
+
+_turned: "weakref.WeakKeyDictionary[Volume, dict[Side, tuple[NDArray[np.float32], Bricks]]]"
+_turned = weakref.WeakKeyDictionary()
+
+
+def turned(volume: Volume, inside: Side) -> tuple[NDArray[np.float32], Bricks]:
+    """Values with the solid upwards, and their bricks; built once for each volume and side."""
+    known = _turned.setdefault(volume, {})
+    if inside not in known:
+        values = volume.values if inside == "above" else -volume.values
+        known[inside] = values, lay_bricks(values)
+    return known[inside]
+
+
+def marchable(scene: Scene) -> Marchable:
+    """Lay out a scene for marching; one field costs no copy."""
+    parts = [turned(f.volume, f.inside) for f in scene.fields]
+    values = [p[0].reshape(-1) for p in parts]
+    bricks = [p[1] for p in parts]
+    records = [b.records.reshape(-1) for b in bricks]
+    materials = [f.material for f in scene.fields] + [q.material for q in scene.quads]
+    together = values[0].view() if len(parts) == 1 else np.concatenate(values)
+    together.setflags(write=False)  # as a lone volume is: else Numba compiles all kernels again, for another type
+    return Marchable(
+        values=together,
+        start=np.cumsum([0, *(len(v) for v in values)], dtype=np.int64)[:-1],
+        shape=np.array([p[0].shape for p in parts], dtype=np.int64),
+        origin=scene.to_frame([f.volume.origin for f in scene.fields]),
+        spacing=np.array([f.volume.spacing for f in scene.fields]),
+        steps=np.array([b.steps for b in bricks]),
+        bricks=records[0] if len(parts) == 1 else np.concatenate(records),
+        brick_start=np.cumsum([0, *(len(b.records) for b in bricks)], dtype=np.int64)[:-1],
+        brick_shape=np.array([b.shape for b in bricks], dtype=np.int64),
+        albedo=np.array([material.albedo for material in materials]),
+        emission=np.array([material.emission for material in materials]),
+        background=np.array(scene.background),
+        **_quads_in_frame(scene),
+    )
+
+
+def _quads_in_frame(scene: Scene) -> dict[str, NDArray[Any]]:
+    """The quad and lamp arrays of a `Marchable`."""
+    axes, count = scene.fields[0].volume.direction, len(scene.quads)
+    corner = scene.to_frame(np.array([q.corner for q in scene.quads]).reshape(count, 3))
+    # The front is a side in the world: where the axes are mirrored it is not edge_u x edge_v of the frame.
+    normal = np.array([q.normal for q in scene.quads]).reshape(count, 3) @ axes
+    edges = np.array([(q.edge_u, q.edge_v) for q in scene.quads]).reshape(count, 2, 3) @ axes
+    across = np.cross(edges[:, ::-1], normal[:, None])
+    area = np.array([q.area for q in scene.quads])
+    power = np.array([q.material.emission.mean() * q.area for q in scene.quads]).reshape(count)
+    lamps = np.flatnonzero(power > 0)
+    chance = power / power.sum() if len(lamps) else power
+    boxes = [index_to_world(f.volume, [np.zeros(3), np.array(f.volume.shape) - 1.0]) for f in scene.fields]
+    ends = [scene.to_frame(np.concatenate(boxes))]
+    ends += [corner + one + other for one in (0, edges[:, 0]) for other in (0, edges[:, 1])]
+    a, b, c = np.ptp(np.concatenate(ends), axis=0)
+    flux = sum((q.material.emission * q.area for q in scene.quads), np.zeros(3))
+    return {
+        "quad_corner": corner,
+        "quad_edges": edges,
+        "quad_duals": across / (edges * across).sum(axis=2, keepdims=True),
+        "quad_normal": normal,
+        "quad_size": np.abs(edges).sum(axis=(1, 2)),
+        "lamps": lamps,
+        "lamp_share": np.cumsum(chance[lamps]),
+        "lamp_density": chance / area if count else power,
+        "lamplight": flux / (2 * (a * b + b * c + c * a)),
+    }
+
+
+def upward(scene: Scene) -> Floats:
+    """+1 or -1 for each field (F,): what turns h and its isovalues so that the solid is upwards."""
+    return np.array([1.0 if f.inside == "above" else -1.0 for f in scene.fields])

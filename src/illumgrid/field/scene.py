@@ -1,0 +1,378 @@
+"""What is lit: fields and their materials, and the light from everywhere outside."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from illumgrid.errors import BadInput
+from illumgrid.field.volume import Floats, Side, Volume, finite, index_to_world
+
+
+def _rgb(value: ArrayLike, name: str, at_most: float) -> Floats:
+    color = np.array(value, dtype=float)
+    if color.shape != (3,) or not np.isfinite(color).all() or (color < 0).any() or (color > at_most).any():
+        upper = "up" if at_most == np.inf else f"to {at_most:g}"
+        raise BadInput(
+            f"{name} is {np.asarray(value).tolist()}; expected three numbers (red, green, blue) from 0 {upper}"
+        )
+    color.setflags(write=False)
+    return color
+
+
+@dataclass(frozen=True, eq=False)
+class Material:
+    """A Lambertian surface.
+
+    Parameters
+    ----------
+    albedo : (3,) array_like
+        Share of the light that is reflected, linear RGB, 0 to 1.
+    emission : (3,) array_like
+        Radiance that leaves the surface by itself, linear RGB.
+    """
+
+    albedo: Floats = field(default_factory=lambda: np.full(3, 0.8))
+    emission: Floats = field(default_factory=lambda: np.zeros(3))
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "albedo", _rgb(self.albedo, "albedo", 1.0))
+        object.__setattr__(self, "emission", _rgb(self.emission, "emission", np.inf))
+
+
+def suggest_range(volume: Volume, inside: Side = "above") -> tuple[float, float, str]:
+    """Isovalues worth sweeping, and why, from the histogram.
+
+    Returns
+    -------
+    low, high : float
+        Otsu's threshold parts background from object; the other end leaves the inmost half of the object inside.
+        With `inside` "below" the same is done for -h.
+    why : str
+        One sentence that says so, with the numbers.
+
+    Raises
+    ------
+    BadInput
+        If the values are constant: no level set is a surface.
+
+    References
+    ----------
+    .. [1] N. Otsu, "A threshold selection method from gray-level histograms", IEEE Trans. SMC 9(1), 1979.
+    """
+    from skimage.filters import threshold_otsu
+
+    # np.float64, not float: NumPy keeps the edges of float32 values in float32, too few of them far from zero.
+    lowest, highest = np.float64(np.nanmin(volume.values)), np.float64(np.nanmax(volume.values))
+    if not (np.isfinite(lowest) and np.isfinite(highest)):
+        volume = finite(volume, inside)
+        lowest, highest = np.float64(volume.values.min()), np.float64(volume.values.max())
+    if lowest == highest:
+        raise BadInput(f"the values are all {lowest:g}; expected a field that varies, or there is no isosurface")
+    counts, edges = np.histogram(volume.values, 1024, (lowest, highest))
+    depth = 0.5 * (edges[1:] + edges[:-1])
+    if inside == "below":
+        counts, depth = counts[::-1], -depth[::-1]
+    sign = 1.0 if inside == "above" else -1.0
+    threshold = float(threshold_otsu(hist=(counts, depth)))
+    within = np.where(depth > threshold, counts, 0)
+    # The bin at which half of the object is passed; at least one bin deeper than the threshold.
+    deep = float(
+        depth[max(np.searchsorted(np.cumsum(within), 0.5 * within.sum()), np.searchsorted(depth, threshold) + 1)]
+    )
+    share = within.sum() / counts.sum()
+    low, high = sorted((sign * threshold, sign * deep))
+    why = (
+        f"Otsu's threshold {sign * threshold:.4g} parts the object ({share:.1%} of the voxels) from the background, "
+        f"and half of the object lies {'above' if inside == 'above' else 'below'} {sign * deep:.4g}"
+    )
+    return low, high, why
+
+
+@dataclass(frozen=True, eq=False)
+class Field:
+    """A volume whose level sets are surfaces.
+
+    Parameters
+    ----------
+    name : str
+    volume : Volume
+        Voxels that are not finite are replaced, with a warning (see `illumgrid.field.volume.finite`).
+    material : Material
+    range : (2,) array_like, optional
+        Lowest and highest isovalue that the user may sweep; by default as `suggest_range` says.
+    inside : {"above", "below"}
+        Which side of the level set is solid: h >= c or h <= c.
+    """
+
+    name: str
+    volume: Volume
+    material: Material = field(default_factory=Material)
+    range: Floats = None  # type: ignore[assignment]
+    inside: Side = "above"
+
+    def __post_init__(self) -> None:
+        if not (isinstance(self.name, str) and self.name and self.name.isprintable()):
+            raise BadInput(f"a field's name is {self.name!r}; expected a printable text")
+        if self.inside not in ("above", "below"):
+            raise BadInput(f"inside of field {self.name!r} is {self.inside!r}; expected 'above' or 'below'")
+        volume = finite(self.volume, self.inside)
+        asked = suggest_range(volume, self.inside)[:2] if self.range is None else self.range
+        limits = np.array(asked, dtype=float)
+        largest = np.finfo(np.float32).max  # of any value of a volume
+        if limits.shape != (2,) or not -largest <= limits[0] < limits[1] <= largest:
+            raise BadInput(
+                f"the range of field {self.name!r} is {np.asarray(asked).tolist()}; expected a low and a high isovalue"
+            )
+        low, high = float(volume.values.min()), float(volume.values.max())
+        if limits[1] < low or limits[0] > high:
+            raise BadInput(
+                f"the range {limits[0]:g} to {limits[1]:g} of field {self.name!r} misses its data, "
+                f"which run from {low:g} to {high:g}; choose isovalues between them"
+            )
+        limits.setflags(write=False)
+        object.__setattr__(self, "volume", volume)
+        object.__setattr__(self, "range", limits)
+
+
+@dataclass(frozen=True, eq=False)
+class Quad:
+    """A parallelogram: a wall, a floor, a luminaire.
+
+    It reflects on both sides and emits on its front only, the side of edge_u × edge_v in the world.
+
+    Parameters
+    ----------
+    name : str
+    corner, edge_u, edge_v : (3,) array_like
+        World position of one corner, and the two edges from there.
+    material : Material
+    texels : (2,) tuple of int
+        Texels of its light along edge_u and edge_v.
+    """
+
+    name: str
+    corner: Floats
+    edge_u: Floats
+    edge_v: Floats
+    material: Material = field(default_factory=Material)
+    texels: tuple[int, int] = (16, 16)
+
+    def __post_init__(self) -> None:
+        if not (isinstance(self.name, str) and self.name and self.name.isprintable()):
+            raise BadInput(f"a quad's name is {self.name!r}; expected a printable text")
+        for name in ("corner", "edge_u", "edge_v"):
+            vector = np.array(getattr(self, name), dtype=float)
+            if vector.shape != (3,) or not np.isfinite(vector).all():
+                raise BadInput(f"{name} of quad {self.name!r} is {vector.tolist()}; expected three finite numbers")
+            vector.setflags(write=False)
+            object.__setattr__(self, name, vector)
+        lengths = np.linalg.norm(self.edge_u) * np.linalg.norm(self.edge_v)
+        if not np.linalg.norm(np.cross(self.edge_u, self.edge_v)) > 1e-6 * lengths:
+            raise BadInput(f"the edges of quad {self.name!r} are parallel or zero; expected two that span an area")
+        texels = tuple(int(n) for n in self.texels)
+        if len(texels) != 2 or min(texels) < 1:
+            raise BadInput(f"texels of quad {self.name!r} are {self.texels}; expected two whole numbers from 1 up")
+        object.__setattr__(self, "texels", texels)
+
+    @property
+    def normal(self) -> Floats:
+        """Unit vector (3,) towards the front."""
+        across = np.cross(self.edge_u, self.edge_v)
+        return np.asarray(across / np.linalg.norm(across))
+
+    @property
+    def area(self) -> float:
+        """Area in squared world units."""
+        return float(np.linalg.norm(np.cross(self.edge_u, self.edge_v)))
+
+
+@dataclass(frozen=True, eq=False)
+class Levels:
+    """A table of isovalues: row k is one setting of all sliders.
+
+    Parameters
+    ----------
+    table : (K, F) float64
+        Isovalue of each field; every column strictly monotone.
+    """
+
+    table: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """Everything that the light meets.
+
+    Parameters
+    ----------
+    fields : sequence of Field
+        At least one; their axes are parallel (equal `direction`), their names differ.
+    quads : sequence of Quad
+        Walls, floors, luminaires; their names differ from one another and from those of the fields.
+    background : (3,) array_like
+        Constant radiance from everywhere outside, linear RGB.
+
+    Notes
+    -----
+    A scene is computed in one frame: the axes of its first field, from its origin. `to_frame` and `from_frame` convert.
+    """
+
+    fields: tuple[Field, ...]
+    quads: tuple[Quad, ...] = ()
+    background: Floats = field(default_factory=lambda: np.zeros(3))
+
+    def __post_init__(self) -> None:
+        fields, quads = tuple(self.fields), tuple(self.quads)
+        if not fields:
+            raise BadInput("the scene has no field; expected at least one")
+        names = [f.name for f in fields] + [q.name for q in quads]
+        for name in names:
+            if names.count(name) > 1:
+                raise BadInput(f"two parts of the scene have the name {name!r}; expected names that differ")
+        for other in fields[1:]:
+            if np.abs(other.volume.direction - fields[0].volume.direction).max() > 1e-6:
+                raise BadInput(
+                    f"the axes of field {other.name!r} differ from those of {fields[0].name!r}; "
+                    "expected one direction for all fields: resample one onto the lattice of the other"
+                )
+        object.__setattr__(self, "fields", fields)
+        object.__setattr__(self, "quads", quads)
+        object.__setattr__(self, "background", _rgb(self.background, "background", np.inf))
+
+    @classmethod
+    def sky(
+        cls,
+        volume: Volume,
+        albedo: ArrayLike = (0.8, 0.8, 0.8),
+        range: ArrayLike | None = None,
+        inside: Side = "above",
+        name: str = "field",
+    ) -> "Scene":
+        """One field under a white sky of radiance 1."""
+        solid = Field(name, volume, Material(np.asarray(albedo)), range, inside)  # type: ignore[arg-type]
+        return cls((solid,), background=np.ones(3))
+
+    @classmethod
+    def floor(
+        cls,
+        volume: Volume,
+        albedo: ArrayLike = (0.8, 0.8, 0.8),
+        range: ArrayLike | None = None,
+        inside: Side = "above",
+        name: str = "field",
+    ) -> "Scene":
+        """One field on a white floor, under a white sky of radiance 1."""
+        scene = cls.sky(volume, albedo, range, inside, name)
+        right, front, up, centre, half = _upright_box(volume)
+        reach = 1.5 * half[:2].max()
+        ground = _wall("floor", centre - half[2] * up, reach * right, -reach * front, np.full(3, 0.75), (32, 32))
+        return cls(scene.fields, (ground,), scene.background)
+
+    @classmethod
+    def box(
+        cls,
+        volume: Volume,
+        albedo: ArrayLike = (0.8, 0.8, 0.8),
+        range: ArrayLike | None = None,
+        inside: Side = "above",
+        name: str = "field",
+    ) -> "Scene":
+        """One field in a closed box, red wall left, green right, a luminaire at the bottom (the paper's Figure 5)."""
+        fields = cls.sky(volume, albedo, range, inside, name).fields
+        return cls(fields, box_around(volume))
+
+    def levels(self, t: ArrayLike) -> Floats:
+        """Settings (n, F) of all sliders for t (n,) from 0, the lowest isovalues, to 1, the highest (clamped)."""
+        low, high = np.array([f.range for f in self.fields]).T
+        share = np.clip(np.atleast_1d(np.asarray(t, float)), 0.0, 1.0)[:, None]
+        return np.asarray((1 - share) * low + share * high)
+
+    def levels_through(self, field: int, isovalues: ArrayLike) -> Floats:
+        """Settings (n, F) with field number `field` at `isovalues` (n,), the others as the common sweep has them."""
+        own = np.atleast_1d(np.asarray(isovalues, float))
+        low, high = self.fields[field].range
+        rows = self.levels((own - low) / (high - low))
+        rows[:, field] = own
+        return rows
+
+    def to_frame(self, points: ArrayLike) -> Floats:
+        """Frame coordinates (n, 3) of world points (n, 3)."""
+        first = self.fields[0].volume
+        local: Floats = (np.asarray(points, float) - first.origin) @ first.direction
+        return local
+
+    def from_frame(self, points: ArrayLike) -> Floats:
+        """World points (n, 3) of frame coordinates (n, 3)."""
+        first = self.fields[0].volume
+        return first.origin + np.asarray(points, float) @ first.direction.T
+
+    def number_of(self, name: str) -> int:
+        """Position of the field with this name.
+
+        Raises
+        ------
+        BadInput
+            If no field has it.
+        """
+        names = [f.name for f in self.fields]
+        if name not in names:
+            raise BadInput(f"no field is named {name!r}; expected one of {', '.join(names)}")
+        return names.index(name)
+
+
+MOST_LEVELS = 2**20  # rows of a level table: far more than any grid tells apart
+
+
+def level_table(scene: Scene, count: int) -> Levels:
+    """`count` equal steps of the common sweep, both ends included."""
+    if not 2 <= count <= MOST_LEVELS:
+        raise BadInput(f"{count} isovalues were asked for; expected at least 2 and at most {MOST_LEVELS}")
+    return Levels(scene.levels(np.linspace(0.0, 1.0, count)))
+
+
+def upright(direction: Floats) -> tuple[Floats, Floats, Floats]:
+    """World directions (3,) right, front, up along the axes of an array with this `direction`, in either sense.
+
+    Up is the axis nearest to world +z, front the one of the others nearest to -y (the face, in medical coordinates).
+    """
+    heights = direction[2]
+    vertical = int(np.argmax(np.abs(heights)))
+    depths = np.where(np.arange(3) == vertical, 0.0, -direction[1])
+    level = int(np.argmax(np.abs(depths)))
+    up = direction[:, vertical] * np.sign(heights[vertical])
+    front = direction[:, level] * (np.sign(depths[level]) or 1.0)
+    return np.cross(up, front), front, up
+
+
+def _upright_box(volume: Volume) -> tuple[Floats, Floats, Floats, Floats, Floats]:
+    """Right, front, up, and the centre and half extents (along those) of the box of a volume's voxel centres."""
+    axes = np.stack(upright(volume.direction), axis=1)
+    last = np.array(volume.shape) - 1.0
+    half = 0.5 * np.abs(axes.T @ (volume.direction * (last * volume.spacing))).sum(axis=1)
+    return axes[:, 0], axes[:, 1], axes[:, 2], index_to_world(volume, last / 2), half
+
+
+def _wall(name: str, centre: Floats, u: Floats, v: Floats, albedo: Floats, texels: tuple[int, int]) -> Quad:
+    """Parallelogram with half edges u and v about its centre; its front is u × v."""
+    return Quad(name, centre - u - v, 2 * u, 2 * v, Material(albedo), texels)
+
+
+def box_around(volume: Volume, margin: float = 0.25) -> tuple[Quad, ...]:
+    """Six walls that look inward at a volume, and a luminaire close above the floor; `margin` in half extents."""
+    right, front, up, centre, half = _upright_box(volume)
+    half = half + margin * half.max()
+    r, f, u = right * half[0], front * half[1], up * half[2]
+    white, red, green = np.full(3, 0.75), np.array([0.63, 0.06, 0.05]), np.array([0.14, 0.45, 0.09])
+    lamp = Quad(
+        "lamp", centre - 0.98 * u - 0.4 * r + 0.4 * f, 0.8 * r, -0.8 * f, Material(np.zeros(3), np.full(3, 8.0)), (1, 1)
+    )
+    return (
+        _wall("floor", centre - u, r, -f, white, (12, 12)),
+        _wall("ceiling", centre + u, r, f, white, (6, 6)),
+        _wall("left", centre - r, f, -u, red, (6, 6)),
+        _wall("right", centre + r, f, u, green, (6, 6)),
+        _wall("back", centre - f, r, u, white, (6, 6)),
+        _wall("front", centre + f, r, -u, white, (6, 6)),
+        lamp,
+    )

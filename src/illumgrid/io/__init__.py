@@ -1,0 +1,1 @@
+"""What is on disk: volumes and scenes, finished runs, exports."""

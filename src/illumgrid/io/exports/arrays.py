@@ -1,0 +1,162 @@
+"""The light of a field as arrays on a lattice, and the formats that hold arrays."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from illumgrid.field.volume import Floats, Lattice, cells, index_to_world, interpolate, world_to_index
+from illumgrid.tone import encode_srgb
+
+if TYPE_CHECKING:
+    from illumgrid.bake import Progress
+    from illumgrid.grid import IlluminationGrid
+    from illumgrid.light import Illumination
+
+NAMES = ("irradiance", "error", "support", "field", "color")
+"""What each point carries, in the order of the files."""
+
+_AT_ONCE = 1 << 18
+"""Points that are looked up together: bounds the memory."""
+
+
+@dataclass(frozen=True, eq=False)
+class Points:
+    """Arrays (nx, ny, nz) or (nx, ny, nz, 3) on a lattice, all of one field.
+
+    Parameters
+    ----------
+    field : str
+        Name of the field.
+    lattice : Lattice
+        Where the points lie in the world.
+    arrays : dict of array
+        By name: irradiance (linear RGB, float32), error, support, field (float32), color (sRGB, uint8).
+    albedo : (3,) float64
+        Of the field's material.
+    exposure : float
+        What `color` was exposed by: sRGB of albedo/π · irradiance · exposure.
+    """
+
+    field: str
+    lattice: Lattice
+    arrays: dict[str, NDArray[Any]]
+    albedo: Floats
+    exposure: float
+
+
+def display_linear(light: "Illumination", number: int, irradiance: NDArray[np.float32]) -> NDArray[np.float32]:
+    """What a screen shows of irradiance (n, 3), before sRGB: albedo/π · E · exposure, not clamped."""
+    factor = light.scene.fields[number].material.albedo / np.pi * light.exposure
+    return np.asarray(irradiance * factor, dtype=np.float32)
+
+
+def points_of(light: "Illumination", number: int, on: str, names: Sequence[str], progress: "Progress") -> Points:
+    """Arrays of field `number` at the nodes of its grid, or at its voxels."""
+    field, grid = light.scene.fields[number], light.grids[number]
+    lattice: Lattice = grid.spec if on == "grid" else field.volume
+    count = int(np.prod(lattice.shape))
+    found: dict[str, list[NDArray[Any]]] = {name: [] for name in names}
+    for first in range(0, count, _AT_ONCE):
+        progress("points", first, count)
+        flat = np.arange(first, min(first + _AT_ONCE, count))
+        world = index_to_world(lattice, np.stack(np.unravel_index(flat, lattice.shape), axis=-1))
+        here = _at(light, number, world, set(names))
+        for name in names:
+            found[name].append(here[name])
+    progress("points", count, count)
+    shaped = {name: np.concatenate(parts) for name, parts in found.items()}
+    shaped = {name: array.reshape(*lattice.shape, *array.shape[1:]) for name, array in shaped.items()}
+    return Points(field.name, lattice, shaped, field.material.albedo, light.exposure)
+
+
+def _at(light: "Illumination", number: int, world: Floats, names: set[str]) -> dict[str, NDArray[Any]]:
+    """The arrays (n,) or (n, 3) at world points (n, 3)."""
+    field, grid = light.scene.fields[number], light.grids[number]
+    here: dict[str, NDArray[Any]] = {}
+    if names & {"irradiance", "color"}:
+        here["irradiance"] = grid.lookup(world)
+        here["color"] = encode_srgb(display_linear(light, number, here["irradiance"]))
+    if names & {"error", "support"}:
+        here["error"], here["support"] = certainty(grid, world)
+    if "field" in names:
+        here["field"] = interpolate(field.volume, world_to_index(field.volume, world)).astype(np.float32)
+    return here
+
+
+def certainty(grid: "IlluminationGrid", world: Floats) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Error and support (n,) of a lookup at world points (n, 3): those of the up to eight nodes that it mixes.
+
+    The error is their weighted mean, which holds however the nodes' errors hang together, and infinite where a node
+    has none; the support is the smallest.
+    """
+    index = np.clip(world_to_index(grid.spec, world), 0, np.array(grid.spec.shape) - 1)
+    cell, f = cells(grid.spec, index)
+    error, support = np.zeros(len(world), np.float32), np.full(len(world), np.inf, np.float32)
+    for corner in np.ndindex(2, 2, 2):
+        weight = np.where(corner, f, 1 - f).prod(axis=1).astype(np.float32)
+        node = tuple((cell + corner).T)
+        mixed = weight > 0
+        error[mixed] += weight[mixed] * grid.error[node][mixed]
+        support[mixed] = np.minimum(support, grid.support[node])[mixed]
+    return error, support
+
+
+def x_fastest(array: NDArray[Any]) -> NDArray[Any]:
+    """(nx, ny, nz, ...) as (nz, ny, nx, ...): in memory x runs fastest, as image formats want it."""
+    return np.ascontiguousarray(array.swapaxes(0, 2))
+
+
+def write_nrrd(path: Path, points: Points, progress: "Progress") -> None:
+    """Write the one array of `points`; space left-posterior-superior, directions as in the world."""
+    import SimpleITK as sitk  # noqa: N813  (its usual name)
+
+    ((name, array),) = points.arrays.items()
+    progress("file", 0, 1)
+    image = sitk.GetImageFromArray(x_fastest(array), isVector=array.ndim == 4)
+    image.SetOrigin(points.lattice.origin.tolist())
+    image.SetSpacing(points.lattice.spacing.tolist())
+    image.SetDirection(points.lattice.direction.ravel().tolist())
+    about = {"illumgrid array": name, "illumgrid field": points.field}
+    if name == "color":
+        about["illumgrid exposure"] = repr(points.exposure)
+    for key, value in about.items():
+        image.SetMetaData(key, value)
+    sitk.WriteImage(image, str(path), useCompression=True)
+    progress("file", 1, 1)
+
+
+def write_exr(path: Path, points: Points, progress: "Progress") -> None:
+    """Write an image nx wide and ny·nz high, float32: R, G, B (irradiance), error, support, field."""
+    import OpenEXR
+
+    from illumgrid.io.store import LAYOUT
+
+    nx, ny, nz = points.lattice.shape
+    progress("file", 0, 1)
+    header = {
+        "type": OpenEXR.scanlineimage, "compression": OpenEXR.ZIP_COMPRESSION, "layout": LAYOUT.format(nx, ny, nz),
+        "origin": points.lattice.origin, "spacing": points.lattice.spacing, "direction": points.lattice.direction,
+        "exposure": points.exposure,
+    }  # fmt: skip
+    channels = {
+        "RGB" if name == "irradiance" else name: x_fastest(array).reshape(nz * ny, nx, *array.shape[3:])
+        for name, array in points.arrays.items()
+        if name != "color"  # an EXR viewer makes its own
+    }
+    OpenEXR.File(header, channels).write(str(path))
+    progress("file", 1, 1)
+
+
+def write_npz(path: Path, points: Points, progress: "Progress") -> None:
+    """Write the arrays, indexed [x, y, z], and where they lie."""
+    lattice = points.lattice
+    progress("file", 0, 1)
+    place: dict[str, Any] = {name: getattr(lattice, name) for name in ("origin", "spacing", "direction")}
+    place |= {"albedo": points.albedo, "exposure": np.float64(points.exposure)}
+    with path.open("wb") as file:  # to a name that ends otherwise, as in .NPZ, NumPy adds .npz
+        np.savez_compressed(file, **(points.arrays | place))
+    progress("file", 1, 1)

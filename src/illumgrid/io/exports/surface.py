@@ -1,0 +1,126 @@
+"""One isosurface with its light as the colour of its vertices: glTF (``.glb``) and PLY."""
+
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from illumgrid.errors import BadInput
+from illumgrid.field.levelset import isosurface
+from illumgrid.io.exports.arrays import display_linear
+from illumgrid.tone import encode_srgb
+
+if TYPE_CHECKING:
+    import trimesh
+
+    from illumgrid.bake import Progress
+    from illumgrid.light import Illumination
+
+Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+"""World to glTF: its up, +y, is the world's +z, and its front, +z, the world's -y (in LPS, the face)."""
+
+
+@dataclass(frozen=True, eq=False)
+class LitSurface:
+    """An isosurface and the light on it.
+
+    Parameters
+    ----------
+    field : str
+    isovalue : float
+    exposure : float
+    mesh : trimesh.Trimesh
+        World units, open where the solid meets the border of the volume.
+    linear : (n, 3) float32
+        albedo/π · irradiance · exposure at the vertices, clamped to 0 .. 1.
+    """
+
+    field: str
+    isovalue: float
+    exposure: float
+    mesh: "trimesh.Trimesh"
+    linear: NDArray[np.float32]
+
+    def about(self) -> dict[str, Any]:
+        """What a reader of the file should know."""
+        return {
+            "field": self.field,
+            "isovalue": self.isovalue,
+            "exposure": self.exposure,
+            "colors": "albedo/pi * irradiance * exposure",
+        }
+
+
+def lit(light: "Illumination", number: int, isovalue: float | None, progress: "Progress") -> LitSurface:
+    """Extract an isosurface of field `number`, by default that in the middle of its range, and look its light up."""
+    field = light.scene.fields[number]
+    low, high = (float(x) for x in field.range)
+    level = 0.5 * (low + high) if isovalue is None else float(isovalue)
+    if not low <= level <= high:
+        raise BadInput(
+            f"the isovalue is {level:g}, but the light of field {field.name!r} is that of {low:g} to {high:g}; choose "
+            "one within, or run again with another --range"
+        )
+    progress("surface", 0, 2)
+    mesh = isosurface(field.volume, level, field.inside)
+    if not len(mesh.faces):
+        raise BadInput(
+            f"field {field.name!r} has no surface at isovalue {level:g}: its values are {field.volume.values.min():g} "
+            f"to {field.volume.values.max():g}; choose an isovalue between"
+        )
+    progress("surface", 1, 2)
+    shown = display_linear(light, number, light.grids[number].lookup(mesh.vertices))
+    progress("surface", 2, 2)
+    progress("file", 0, 1)
+    return LitSurface(field.name, level, light.exposure, mesh, np.clip(shown, 0.0, 1.0))
+
+
+def write_glb(path: Path, surface: LitSurface) -> None:
+    """Write binary glTF 2.0: linear float colours, unlit, y up; the mesh's extras say what the colours are.
+
+    trimesh writes vertex colours as bytes, in which linear light has bands in the dark, so that they go by the way it
+    has for any attribute. Positions are single precision: they are kept about the mesh's centre, and a node puts it
+    where it is in the world, turned.
+    """
+    import trimesh
+
+    centre = surface.mesh.bounds.mean(axis=0)
+    mesh = trimesh.Trimesh(surface.mesh.vertices - centre, surface.mesh.faces, process=False)
+    mesh.vertex_attributes["_light"] = surface.linear
+    mesh.metadata.update(surface.about())
+    place = np.eye(4)
+    place[:3, :3], place[:3, 3] = Y_UP, Y_UP @ centre
+    scene = trimesh.Scene()
+    scene.add_geometry(mesh, geom_name=surface.field, node_name=surface.field, transform=place)
+    scene.metadata.clear()
+    path.write_bytes(trimesh.exchange.gltf.export_glb(scene, include_normals=False, tree_postprocessor=_unlit))
+
+
+def _unlit(tree: dict[str, Any]) -> None:
+    """Make the attribute the colour, and the material one that no lamp of a viewer lights."""
+    tree["asset"]["generator"] = f"illumgrid {version('illumgrid')} with {tree['asset']['generator']}"
+    tree["extensionsUsed"] = ["KHR_materials_unlit"]
+    base = {"baseColorFactor": [1, 1, 1, 1], "metallicFactor": 0, "roughnessFactor": 1}  # for viewers without unlit
+    tree["materials"] = [
+        {"name": "light", "extensions": {"KHR_materials_unlit": {}}, "pbrMetallicRoughness": base, "doubleSided": True}
+    ]
+    for mesh in tree["meshes"]:
+        for primitive in mesh["primitives"]:
+            primitive["attributes"]["COLOR_0"] = primitive["attributes"].pop("_light")
+            primitive["material"] = 0
+
+
+def write_ply(path: Path, surface: LitSurface) -> None:
+    """Write binary PLY: world coordinates, sRGB bytes, and comments that say what the colours are."""
+    import trimesh
+
+    mesh = trimesh.Trimesh(surface.mesh.vertices, surface.mesh.faces, process=False)
+    mesh.visual = trimesh.visual.ColorVisuals(mesh, vertex_colors=encode_srgb(surface.linear))
+    content = trimesh.exchange.ply.export_ply(mesh, vertex_normal=False)
+    about = {"illumgrid": version("illumgrid"), **surface.about(), "encoding": "sRGB"}
+    comments = "".join(f"comment {key} {value}\n" for key, value in about.items())
+    head = b"format binary_little_endian 1.0\n"
+    path.write_bytes(content.replace(head, head + comments.encode("ascii", "backslashreplace"), 1))

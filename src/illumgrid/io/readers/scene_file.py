@@ -1,0 +1,232 @@
+"""Scenes from files: a .toml with tables for fields, quads and the background."""
+
+import difflib
+import os
+import tomllib
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from illumgrid.errors import BadInput
+from illumgrid.field.scene import Field, Material, Quad, Scene
+from illumgrid.field.volume import Volume, finite, smooth
+
+LIMIT = 1 << 20
+"""Bytes that a scene file may have: it holds words, the voxels are elsewhere."""
+
+LONGEST_LINE = 2000
+"""Characters. The time that tomllib takes for a key grows with the square of its dots."""
+
+EXPECTED = "expected a scene file: TOML with one or more [[field]] tables"
+
+Table = dict[str, Any]
+Take = Callable[[str, Any], Any]
+"""From a key and what a file says there to what a dataclass takes; bounds of its own are left to the dataclass."""
+
+
+def read_scene(path: str | os.PathLike[str], *, smoothing: float = 0.0) -> Scene:
+    """Read a scene from a .toml file.
+
+    Parameters
+    ----------
+    path : str or path-like
+        UTF-8, at most 1 MB, with these tables: ``[[field]]``, one or more, with `name`, `volume` (what `read_volume`
+        reads, relative to this file) and perhaps `albedo`, `emission`, `range`, `inside`; ``[[quad]]`` with `name`,
+        `corner`, `edge_u`, `edge_v` and perhaps `albedo`, `emission`, `texels`; ``[background]`` with `radiance`. What
+        is left out has the default of `Field`, `Material`, `Quad` or `Scene`.
+    smoothing : float, optional
+        Standard deviation, in voxels, of a Gaussian that blurs every field before anything else.
+
+    Returns
+    -------
+    scene : Scene
+
+    Raises
+    ------
+    BadInput
+        If it is not such a file, or a volume cannot be read; the sentence names file, table and key.
+    """
+    file = Path(os.path.abspath(path))
+    with _place(file.name):
+        try:
+            return _scene(_tables(_content(file)), file.parent, smoothing)
+        except RecursionError:
+            raise BadInput(f"is nested too deeply; {EXPECTED}; leave the dotted keys and nested brackets out") from None
+
+
+@contextmanager
+def _place(words: str) -> Iterator[None]:
+    """Say where the trouble is, before what it is."""
+    try:
+        yield
+    except BadInput as problem:
+        raise BadInput(f"{words}: {problem}") from None
+
+
+def _content(file: Path) -> bytes:
+    try:
+        if file.is_dir():
+            raise BadInput(f"a folder; {EXPECTED}; give the file in it")
+        if not file.exists():
+            raise BadInput(f"there is no such file; {EXPECTED}; check the path")
+        if not file.is_file():
+            raise BadInput(f"neither a file nor a folder; {EXPECTED}; copy it into a file")
+        with open(file, "rb") as stream:
+            content = stream.read(LIMIT + 1)
+    except OSError as problem:
+        raise BadInput(f"cannot be read ({problem.strerror}); {EXPECTED}; check path and permissions") from None
+    if len(content) > LIMIT:
+        raise BadInput(f"more than {LIMIT} bytes; {EXPECTED}; keep the voxels in files of their own")
+    return content
+
+
+def _tables(content: bytes) -> Table:
+    try:
+        text = content.decode("utf-8-sig")
+        if any(len(line) > LONGEST_LINE for line in text.split("\n")):
+            raise BadInput(f"a line has more than {LONGEST_LINE} characters; {EXPECTED}; break it")
+        return tomllib.loads(text)
+    except UnicodeDecodeError as problem:
+        raise BadInput(f"byte {problem.start} is not UTF-8; {EXPECTED}; save it as UTF-8 text") from None
+    except BadInput:
+        raise
+    except ValueError as problem:  # of tomllib, or of a number with thousands of digits
+        reason = " ".join(str(problem).split()).replace(". ", ", ")[:200]
+        raise BadInput(f"not TOML ({reason}); {EXPECTED}; mend it there") from None
+
+
+def _shown(value: Any) -> str:
+    """What came, on one line that is not long."""
+    text = repr(value)
+    return text if len(text) <= 80 else f"{text[:60]}… ({len(text)} characters)"
+
+
+def _text(key: str, value: Any) -> str:
+    if not (isinstance(value, str) and value and value.isprintable()):
+        raise BadInput(f"{key} is {_shown(value)}; expected a printable text in quotes")
+    return value
+
+
+def _side(key: str, value: Any) -> str:
+    if value not in ("above", "below"):
+        raise BadInput(f"{key} is {_shown(value)}; expected 'above' or 'below'")
+    return str(value)
+
+
+def _numbers(count: int, expected: str, kind: type[int] | type[float] = float, most: float = 1e30) -> Take:
+    """Takes a list of `count` numbers (whole ones if `kind` is int) that are finite and not beyond `most`."""
+
+    def good(x: Any) -> bool:
+        # In Python true is a whole number; NaN is not at most anything.
+        return not isinstance(x, bool) and isinstance(x, (int, kind)) and -most <= x <= most
+
+    def take(key: str, value: Any) -> list[Any]:
+        if not (isinstance(value, list) and len(value) == count and all(map(good, value))):
+            raise BadInput(f"{key} is {_shown(value)}; expected {expected}, none beyond {most:g}")
+        return value
+
+    return take
+
+
+_COLOUR = _numbers(3, "three numbers in brackets (red, green, blue)")
+_VECTOR = _numbers(3, "three numbers in brackets (x, y, z in world units)")
+_MATERIAL = {"albedo": _COLOUR, "emission": _COLOUR}
+_FIELD: Mapping[str, Take] = {
+    "name": _text,
+    "volume": _text,
+    **_MATERIAL,
+    "range": _numbers(2, "two numbers in brackets (lowest and highest isovalue)", most=1e300),
+    "inside": _side,
+}
+_QUAD: Mapping[str, Take] = {
+    "name": _text,
+    "corner": _VECTOR,
+    "edge_u": _VECTOR,
+    "edge_v": _VECTOR,
+    **_MATERIAL,
+    "texels": _numbers(2, "two whole numbers in brackets (along edge_u and edge_v)", int, 4096),
+}
+_BACKGROUND: Mapping[str, Take] = {"radiance": _COLOUR}
+
+
+def _unknown(kind: str, name: str, known: Mapping[str, Any]) -> BadInput:
+    close = difflib.get_close_matches(name, known, 1)
+    hint = f"; did you mean {close[0]!r}?" if close else ""
+    return BadInput(f"there is no {kind} {_shown(name)}; expected only {', '.join(known)}{hint}")
+
+
+def _checked(table: Table, keys: Mapping[str, Take], required: tuple[str, ...]) -> Table:
+    """What the table says, after the check that it has the required keys, no others than `keys`, and good values."""
+    for key in table:
+        if key not in keys:
+            raise _unknown("key", key, keys)
+    for key in required:
+        if key not in table:
+            raise BadInput(f"{key} is missing, there is {', '.join(table) or 'nothing'}; expected {key} = ...; add it")
+    return {key: keys[key](key, value) for key, value in table.items()}
+
+
+def _listed(tables: Table, kind: str, keys: Mapping[str, Take], required: tuple[str, ...]) -> list[tuple[str, Table]]:
+    """The tables [[kind]], checked, each with the words that say where it is: number and name."""
+    found = tables.get(kind, [])
+    if not (isinstance(found, list) and all(isinstance(table, dict) for table in found)):
+        came = f"the single table [{kind}]" if isinstance(found, dict) else f"{kind} = {_shown(found)}"
+        raise BadInput(f"{came} came; expected tables [[{kind}]], in double brackets")
+    placed = []
+    for number, table in enumerate(found, 1):
+        name = table.get("name")
+        place = f"[[{kind}]] {number}" + (f" {_shown(name)}" if isinstance(name, str) else "")
+        with _place(place):
+            placed.append((place, _with_material(_checked(table, keys, required))))
+    return placed
+
+
+def _scene(tables: Table, folder: Path, smoothing: float) -> Scene:
+    for name in tables:
+        if name not in ("field", "quad", "background"):
+            raise _unknown("table", name, {"field": 0, "quad": 0, "background": 0})
+    fields = _listed(tables, "field", _FIELD, ("name", "volume"))
+    quads = _listed(tables, "quad", _QUAD, ("name", "corner", "edge_u", "edge_v"))
+    background = tables.get("background", {})
+    if not isinstance(background, dict):
+        raise BadInput(f"background is {_shown(background)}; expected one table [background] with radiance = [0, 0, 0]")
+    with _place("[background]"):
+        radiance = _checked(background, _BACKGROUND, ()).get("radiance", [0, 0, 0])
+        if min(radiance) < 0:
+            raise BadInput(f"radiance is {radiance}; expected three numbers from 0 up")
+    if not fields:
+        raise BadInput("there is no [[field]]; expected at least one, with name and volume")
+    seen: dict[str, str] = {}
+    for place, table in (*fields, *quads):
+        if table["name"] in seen:
+            raise BadInput(f"{place}: name is that of {seen[table['name']]}, too; expected names that differ")
+        seen[table["name"]] = place
+    walls, solids = [], []
+    for place, table in quads:
+        with _place(place):
+            walls.append(Quad(**table))
+    volumes: dict[str, Volume] = {}  # two fields may be two ranges of one file
+    for place, table in fields:  # last, because reading takes longest
+        with _place(place):
+            solids.append(Field(**{**table, "volume": _volume(table, folder, smoothing, volumes)}))
+    return Scene(tuple(solids), tuple(walls), radiance)
+
+
+def _with_material(table: Table) -> Table:
+    """The table with `material` in place of `albedo` and `emission`."""
+    rest = {key: value for key, value in table.items() if key not in _MATERIAL}
+    return {**rest, "material": Material(**{key: table[key] for key in _MATERIAL if key in table})}
+
+
+def _volume(table: Table, folder: Path, smoothing: float, read: dict[str, Volume]) -> Volume:
+    """Volume of a field, smoothed; `read` keeps what other fields have read."""
+    from illumgrid.io.readers import read_volume
+
+    name = table["volume"]
+    with _place("volume"):
+        if name not in read:
+            read[name] = read_volume(folder / name)
+        if smoothing == 0:
+            return read[name]
+        return smooth(finite(read[name], table.get("inside", "above")), smoothing)

@@ -1,0 +1,391 @@
+"""A finished run on the disk: a folder with ``illumination.exr``, ``run.json`` and perhaps ``preview.png``.
+
+``illumination.exr`` is a multi-part OpenEXR file, float32, scan lines, ZIP. Each field has two parts,
+
+- ``light/<field name>``: channels R, G, B (irradiance), error and support of its illumination grid;
+- ``field/<field name>``: channel Y, the field's values as they were used;
+
+and each quad one, ``wall/<quad name>``: channels R, G, B and support of its texels, (nu, nv, rows of the level table).
+
+A 3D array (nx, ny, nz) is an image nx wide and ny*nz high: row = z*ny + y, column = x. ``run.json`` says where the
+arrays lie in the world, and all else. Its ``checksum`` covers itself and the EXR file: the EXR library never sees a
+damaged file, and a digit that changed is never taken for a result.
+"""
+
+import hashlib
+import json
+import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from importlib.metadata import version
+from math import prod
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import OpenEXR
+from numpy.typing import NDArray
+
+from illumgrid.errors import BadInput
+from illumgrid.field.scene import Field, Levels, Material, Quad, Scene
+from illumgrid.field.volume import Lattice, Volume
+from illumgrid.grid import GridSpec, IlluminationGrid, WallTexture
+
+FORMAT = 1
+EXR, RUN, PREVIEW = "illumination.exr", "run.json", "preview.png"
+PLACE = ("origin", "spacing", "direction")
+EDGES = ("corner", "edge_u", "edge_v")
+LAYOUT = "array (nx, ny, nz) = ({}, {}, {}); row = z*ny + y, column = x"
+DEFLATE_AT_MOST = 1032  # bytes out for one byte in: a file that claims more is refused before memory is asked for
+ELSEWHERE = "choose another folder with -o"
+AGAIN = "give a folder that 'illumgrid run' wrote, or run it again"
+
+Image = NDArray[np.float32]
+Plan = dict[str, tuple[tuple[int, int, int], str]]  # of every part, in the order of the file: array shape, channels
+Record = dict[str, Any]  # the content of run.json
+
+
+@dataclass(frozen=True, eq=False)
+class Stored:
+    """What a finished folder holds, apart from the picture: one grid and one column of levels for every field.
+
+    The recipe says how the run was made, in what JSON has: finite numbers, text, booleans, None, lists, dicts of text.
+    """
+
+    scene: Scene
+    levels: Levels
+    grids: tuple[IlluminationGrid, ...]
+    walls: tuple[WallTexture, ...]
+    recipe: dict[str, Any]
+
+    def __post_init__(self) -> None:
+        fields, table = len(self.scene.fields), np.asarray(self.levels.table)
+        if len(self.grids) != fields:
+            raise BadInput(f"{len(self.grids)} grids came for {fields} fields; expected one each")
+        if len(self.walls) != len(self.scene.quads):
+            raise BadInput(f"{len(self.walls)} wall textures came for {len(self.scene.quads)} quads; expected one each")
+        if table.ndim != 2 or not table.size or table.shape[1] != fields or not np.isfinite(table).all():
+            raise BadInput(f"the level table has shape {table.shape}; expected finite isovalues, one column a field")
+
+
+def claim(folder: str | os.PathLike[str], overwrite: bool) -> None:
+    """See whether a result may be put at `folder`; changes nothing.
+
+    Raises
+    ------
+    BadInput
+        If it holds a finished run (unless `overwrite`) or anything that is not ours, or cannot be made or replaced.
+    """
+    with _sentences(f"{folder} cannot be written to", ELSEWHERE):
+        place = Path(os.path.abspath(folder))
+        parent = next(p for p in place.parents if os.path.lexists(p))
+        tempfile.TemporaryDirectory(dir=parent, prefix=".").cleanup()  # permissions, quota, read-only: trying tells
+        try:
+            place.lstat()
+        except FileNotFoundError:
+            return
+        if place.is_symlink() or not place.is_dir():
+            raise BadInput(f"{folder} is {'a symbolic link' if place.is_symlink() else 'not a folder'}; {ELSEWHERE}")
+        if os.path.ismount(place) or place.samefile(Path.cwd()):  # the folder is replaced as a whole
+            raise BadInput(f"{folder} is a mount point or the folder you are in; choose a folder inside it with -o")
+        _refuse_foreign(place, folder)
+        if not overwrite and any(place.iterdir()):
+            raise BadInput(f"{folder} holds a finished run; pass --overwrite or {ELSEWHERE}")
+
+
+def _refuse_foreign(place: Path, folder: str | os.PathLike[str]) -> None:
+    """Raise unless `place`, which the user calls `folder`, is empty or a finished run and nothing besides."""
+    plain = {p.name: p.is_file() and not p.is_symlink() for p in place.iterdir()}
+    foreign = sorted(name for name in plain if not plain[name] or name not in (EXR, RUN, PREVIEW))
+    if plain and not {EXR, RUN} <= plain.keys():
+        foreign = foreign or sorted(plain)  # not a run: a file that happens to have such a name
+    if foreign:
+        raise BadInput(f"{folder} holds {foreign[0]!r}, which is not of a finished run; {ELSEWHERE}")
+
+
+def write(folder: str | os.PathLike[str], stored: Stored, picture: bytes | None, overwrite: bool) -> None:
+    """Put a finished run, and its `picture` as PNG, at `folder`, whole or not at all; parents are made as needed.
+
+    Raises
+    ------
+    BadInput
+        As `claim` does, also if another run took the folder meanwhile; and if the disk is full.
+    """
+    record = _describe(stored)
+    claim(folder, overwrite)
+    with _sentences(f"{folder} could not be written; the disk may be full", ELSEWHERE):
+        place = Path(os.path.abspath(folder))
+        place.parent.mkdir(parents=True, exist_ok=True)
+        hidden = f".{place.name[:50]}-"  # cut, or a long name would get too long
+        with tempfile.TemporaryDirectory(prefix=hidden, dir=place.parent, ignore_cleanup_errors=True) as work:
+            fresh = Path(work) / "new"
+            fresh.mkdir()  # with the umask's mode; `work` is closed to others
+            _write_exr(fresh / EXR, stored)
+            _read_exr(fresh / EXR, _plan(record))  # the library flushes where it cannot report a full disk: look
+            record["checksum"] = _checksum(record, fresh / EXR)
+            (fresh / RUN).write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
+            if picture is not None:
+                (fresh / PREVIEW).write_bytes(picture)
+            claim(folder, overwrite)
+            _move(fresh, place, Path(work) / "old", overwrite)
+
+
+def _move(fresh: Path, place: Path, old: Path, overwrite: bool) -> None:
+    """Rename `fresh` to `place`; an older run there goes to `old`, and back if that fails.
+
+    A kill between the two renames leaves nothing at `place` and both runs whole in the hidden folder beside it: some
+    microseconds in which nothing is lost, not worth an atomic exchange that only Linux has.
+    """
+    try:
+        with suppress(OSError):  # only an empty folder goes
+            place.rmdir()
+        if overwrite and place.exists():
+            place.rename(old)
+            _refuse_foreign(old, place)  # what came in since we looked
+        fresh.rename(place)
+    except BaseException as reason:
+        with suppress(OSError):
+            old.rename(place)
+        if isinstance(reason, OSError) and place.exists():
+            raise BadInput(f"{place} was taken by another run meanwhile; {ELSEWHERE}") from reason
+        raise
+
+
+def read(folder: str | os.PathLike[str]) -> Stored:
+    """Read a finished run, trusting nothing.
+
+    Raises
+    ------
+    BadInput
+        If what the folder holds is not a whole and unchanged run of the format known here.
+    """
+    place = Path(folder)
+    for name in (EXR, RUN):
+        if not (place / name).is_file():
+            raise BadInput(f"{place / name} is missing; {AGAIN}")
+    with _sentences(f"{place / RUN} is not the record of a run", AGAIN):
+        record = _read_record(place / RUN)
+        plan = _plan(record)
+    with _sentences(f"{place / EXR} cannot be used", AGAIN):
+        if record["checksum"] != _checksum(record, place / EXR):
+            raise BadInput(f"it, or {RUN} beside it, was damaged or changed since it was written")
+        parts = _read_exr(place / EXR, plan)
+    with _sentences(f"{place / RUN} is not the record of a run", AGAIN):
+        return _rebuild(record, parts)
+
+
+@contextmanager
+def _sentences(trouble: str, remedy: str) -> Iterator[None]:
+    """Turn whatever goes wrong into one sentence of what came and what to do."""
+    try:
+        yield
+    except BadInput as reason:
+        if str(reason).endswith(("with -o", remedy)):
+            raise
+        raise BadInput(f"{trouble}: {reason}; {remedy}") from reason
+    except Exception as reason:  # the EXR library raises RuntimeError, ValueError, UnicodeDecodeError...
+        what = reason.strerror if isinstance(reason, OSError) else f"{type(reason).__name__} {reason}"
+        raise BadInput(f"{trouble} ({what}); {remedy}") from reason
+
+
+def _describe(stored: Stored) -> Record:
+    """All but the arrays, as JSON reads it back (it keeps floats exactly, makes tuples lists and keys text)."""
+
+    def lattice(of: Lattice) -> Record:
+        return {"shape": of.shape} | {name: getattr(of, name).tolist() for name in PLACE}
+
+    fields = [
+        {"name": f.name, "range": f.range.tolist(), "inside": f.inside}
+        | {"albedo": f.material.albedo.tolist(), "emission": f.material.emission.tolist()}
+        | lattice(f.volume)
+        for f in stored.scene.fields
+    ]
+    quads = [
+        {"name": q.name, "texels": list(q.texels)}
+        | {name: getattr(q, name).tolist() for name in EDGES}
+        | {"albedo": q.material.albedo.tolist(), "emission": q.material.emission.tolist()}
+        for q in stored.scene.quads
+    ]
+    record = {
+        "format": FORMAT,
+        "illumgrid": version("illumgrid"),
+        "scene": {"fields": fields, "quads": quads, "background": stored.scene.background.tolist()},
+        "levels": np.asarray(stored.levels.table, float).tolist(),
+        "grids": {f.name: lattice(grid.spec) for f, grid in zip(stored.scene.fields, stored.grids)},
+        "recipe": stored.recipe,
+    }
+    return dict(json.loads(json.dumps(record, allow_nan=False)))
+
+
+def _checksum(record: Record, exr: Path) -> str:
+    with exr.open("rb") as file:
+        digest = hashlib.file_digest(file, "sha256")
+    rest = {key: value for key, value in record.items() if key != "checksum"}
+    digest.update(json.dumps(rest, sort_keys=True, allow_nan=False).encode())
+    return digest.hexdigest()
+
+
+def _read_record(path: Path) -> Record:
+    record: Record = json.loads(path.read_text(encoding="utf-8"))
+    if record["format"] != FORMAT:
+        raise BadInput(f"its format is {record['format']!r}; illumgrid {version('illumgrid')} reads format {FORMAT}")
+    if not isinstance(record["recipe"], dict):
+        raise BadInput("its recipe is not a table")
+    return record
+
+
+def _rebuild(record: Record, parts: dict[str, dict[str, Image]]) -> Stored:
+    grids, fields = [], []
+    for about in record["scene"]["fields"]:
+        where, light = record["grids"][about["name"]], parts.pop(f"light/{about['name']}")
+        spec = GridSpec(_shape(where), *(where[k] for k in PLACE))
+        grids.append(IlluminationGrid(spec, *(_array(light.pop(c), spec.shape) for c in ("RGB", "error", "support"))))
+        values = _array(parts.pop(f"field/{about['name']}")["Y"], _shape(about))
+        volume, material = Volume(values, *(about[k] for k in PLACE)), Material(about["albedo"], about["emission"])
+        fields.append(Field(about["name"], volume, material, about["range"], about["inside"]))
+    quads, walls = [], []
+    for about in record["scene"]["quads"]:
+        texels, shape = parts.pop(f"wall/{about['name']}"), _wall_shape(about, record)
+        values, support = (_array(texels[c], shape).swapaxes(0, 2) for c in ("RGB", "support"))
+        walls.append(WallTexture(np.ascontiguousarray(values), np.ascontiguousarray(support)))
+        material = Material(about["albedo"], about["emission"])
+        corner, edge_u, edge_v = (np.array(about[name], float) for name in EDGES)
+        quads.append(Quad(about["name"], corner, edge_u, edge_v, material, (shape[0], shape[1])))
+    scene = Scene(tuple(fields), tuple(quads), record["scene"]["background"])
+    return Stored(scene, Levels(np.array(record["levels"], float)), tuple(grids), tuple(walls), record["recipe"])
+
+
+def _shape(about: Record) -> tuple[int, int, int]:
+    match about["shape"]:
+        case [int(nx), int(ny), int(nz)] if min(nx, ny, nz) >= 2:
+            return nx, ny, nz
+    raise BadInput(f"the shape {str(about['shape'])[:80]} came; expected three whole numbers of at least 2")
+
+
+def _wall_shape(about: Record, record: Record) -> tuple[int, int, int]:
+    match about["texels"]:
+        case [int(nu), int(nv)] if min(nu, nv) >= 1:
+            return nu, nv, len(record["levels"])
+    raise BadInput(f"the texels {str(about['texels'])[:80]} came; expected two whole numbers of at least 1")
+
+
+def _plan(record: Record) -> Plan:
+    plan: Plan = {}
+    for about in record["scene"]["fields"]:
+        plan[f"light/{about['name']}"] = _shape(record["grids"][about["name"]]), "B G R error support"
+        plan[f"field/{about['name']}"] = _shape(about), "Y"
+    for about in record["scene"]["quads"]:
+        plan[f"wall/{about['name']}"] = _wall_shape(about, record), "B G R support"
+    return plan
+
+
+def _image(array: Image) -> Image:
+    """Lay out an array (nx, ny, nz) as an image (nz*ny, nx), an array (nx, ny, nz, 3) as (nz*ny, nx, 3)."""
+    nx, ny, nz = array.shape[:3]
+    return np.ascontiguousarray(array.swapaxes(0, 2)).reshape(nz * ny, nx, *array.shape[3:])
+
+
+def _array(image: Image, shape: tuple[int, int, int]) -> Image:
+    """Undo `_image`, without a copy."""
+    return image.reshape(*shape[::-1], *image.shape[2:]).swapaxes(0, 2)
+
+
+def _write_exr(path: Path, stored: Stored) -> None:
+    arrays: dict[str, dict[str, Image]] = {}
+    for f, grid in zip(stored.scene.fields, stored.grids):
+        arrays[f"light/{f.name}"] = {"RGB": grid.values, "error": grid.error, "support": grid.support}
+        arrays[f"field/{f.name}"] = {"Y": f.volume.values}
+    for quad, wall in zip(stored.scene.quads, stored.walls):
+        turned = {"RGB": wall.values, "support": wall.support}
+        arrays[f"wall/{quad.name}"] = {channel: array.swapaxes(0, 2) for channel, array in turned.items()}
+    shapes = [next(iter(channels.values())).shape for channels in arrays.values()]
+    window = ((0, 0), (max(s[0] for s in shapes) - 1, max(s[1] * s[2] for s in shapes) - 1))  # all parts must share it
+    common = {"type": OpenEXR.scanlineimage, "compression": OpenEXR.ZIP_COMPRESSION, "displayWindow": window}
+    parts = [
+        OpenEXR.Part(common | {"layout": LAYOUT.format(*shape)}, {c: _image(a) for c, a in channels.items()}, name)
+        for (name, channels), shape in zip(arrays.items(), shapes)
+    ]
+    OpenEXR.File(parts).write(os.fsencode(path))
+
+
+def _read_exr(path: Path, plan: Plan) -> dict[str, dict[str, Image]]:
+    """Images of every part by channel, "RGB" as one, if the headers agree with the plan."""
+    size = path.stat().st_size
+    if sum(4 * prod(shape) * len(channels.split()) for shape, channels in plan.values()) > DEFLATE_AT_MOST * size:
+        raise BadInput(f"its {size} bytes cannot hold the arrays that {RUN} tells of")
+    kind = OpenEXR.scanlineimage, OpenEXR.ZIP_COMPRESSION
+    expected = [(name, *kind, [[0, 0], [x - 1, z * y - 1]], c.split()) for name, ((x, y, z), c) in plan.items()]
+    for pixels in (False, True):
+        file = OpenEXR.File(os.fsencode(path), header_only=not pixels)
+        found = []  # the library leaves out a part whose pixels it cannot read; before 3.4.12, all without pixels
+        for h in (part.header for part in file.parts):
+            window = [np.asarray(corner).tolist() for corner in h["dataWindow"]]
+            found.append((h["name"], h["type"], h["compression"], window, sorted(c.name for c in h["channels"])))
+        if found != expected and (pixels or found):
+            raise BadInput(f"its parts are not those that {RUN} tells of, or cannot be read")
+    images = {part.name(): {c: image.pixels for c, image in part.channels.items()} for part in file.parts}
+    if any(image.dtype != np.float32 for part in images.values() for image in part.values()):
+        raise BadInput("its pixels are not float32")
+    return images
+
+
+def is_run(folder: str | os.PathLike[str]) -> bool:
+    """Whether a folder looks like a finished run, rather than one of DICOM slices."""
+    return (Path(folder) / RUN).is_file() or (Path(folder) / EXR).is_file()
+
+
+@contextmanager
+def fresh_file(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """Give a place beside `path` to write a file to, and rename it in the end: whole, or not there.
+
+    Raises
+    ------
+    BadInput
+        If it cannot be written.
+    """
+    place = Path(path)
+    with _sentences(f"{path} could not be written", "choose another place"):
+        if place.is_dir():
+            raise BadInput(f"{path} is a folder; expected the name of a file")
+        place.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=f".{place.name[:50]}-", dir=place.parent) as work:
+            fresh = Path(work) / f"new{place.suffix}"  # libraries choose the format by the ending
+            yield fresh
+            fresh.replace(place)
+
+
+def write_file(path: str | os.PathLike[str], content: bytes) -> None:
+    """Write a file as `fresh_file` does."""
+    with fresh_file(path) as fresh:
+        fresh.write_bytes(content)
+
+
+def claim_new(path: str | os.PathLike[str]) -> None:
+    """Raise BadInput if something is at `path` already, but for an empty folder."""
+    place = Path(os.path.abspath(path))
+    if place.exists() and not (place.is_dir() and not any(place.iterdir())):
+        raise BadInput(f"{path} is there already; expected the name of a new folder: choose another")
+
+
+def write_folder(path: str | os.PathLike[str], files: Iterator[tuple[str, bytes]]) -> None:
+    """Write named files into a new folder beside its place and rename it: whole, or not there.
+
+    Raises
+    ------
+    BadInput
+        If something is there already, before the first file is asked for; or if it cannot be written.
+    """
+    claim_new(path)
+    place = Path(os.path.abspath(path))
+    with _sentences(f"{path} could not be written", "choose another place"):
+        place.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=f".{place.name[:50]}-", dir=place.parent) as work:
+            fresh = Path(work) / "new"
+            fresh.mkdir()
+            for name, content in files:
+                (fresh / name).write_bytes(content)
+            with suppress(OSError):
+                place.rmdir()
+            fresh.rename(place)

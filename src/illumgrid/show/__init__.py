@@ -1,0 +1,1 @@
+"""Pictures: still, swept, and on a page."""

@@ -1,0 +1,160 @@
+"""Where a picture is seen from."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from illumgrid.errors import BadInput
+from illumgrid.field.levelset import turned, upward
+from illumgrid.field.scene import Scene, upright
+from illumgrid.field.volume import Floats, Lattice, index_to_world
+
+HALF_ANGLE = 0.27  # tangent of half the vertical angle of view, 30 degrees in all
+MARGIN = 1.08  # the picture is this much larger than what it holds
+VIEWS = {
+    "front": (0.0, 0.0), "back": (180.0, 0.0), "right": (90.0, 0.0), "left": (-90.0, 0.0),
+    "top": (0.0, 90.0), "bottom": (0.0, -90.0), "iso": (45.0, math.degrees(math.asin(1 / math.sqrt(3)))),
+}  # fmt: skip
+"""Azimuth and elevation in degrees: from the front to the right, and upwards."""
+
+View = str | tuple[float, float] | None
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A pinhole camera in the world.
+
+    Parameters
+    ----------
+    eye : (3,) float64
+    right, up, forward : (3,) float64
+        Orthonormal, forward × up = right: whatever the axes of the data, a picture is never mirrored.
+    tangent : float
+        Tangent of half the vertical angle of view.
+    """
+
+    eye: Floats
+    right: Floats
+    up: Floats
+    forward: Floats
+    tangent: float
+
+
+def angles(view: str | tuple[float, float]) -> tuple[float, float]:
+    """Azimuth and elevation, in degrees, of a named view or of ``"azimuth,elevation"``.
+
+    Raises
+    ------
+    BadInput
+        On an unknown name, or numbers that are no angles.
+    """
+    if isinstance(view, str) and view in VIEWS:
+        return VIEWS[view]
+    try:
+        azimuth, elevation = map(float, view.split(",") if isinstance(view, str) else view)
+    except (TypeError, ValueError):
+        azimuth = elevation = math.nan
+    if not (math.isfinite(azimuth) and -90 <= elevation <= 90):
+        raise BadInput(
+            f"the view is {view!r}; expected one of {', '.join(VIEWS)}, or azimuth,elevation in degrees such as 30,18, "
+            "with an elevation from -90 to 90"
+        )
+    return azimuth, elevation
+
+
+def _column_ends(values: NDArray[np.float32], level: float) -> Floats:
+    """Indices (m, 3) where the columns of `values` along the last axis enter and leave the solid {v >= level}."""
+    solid = values >= level
+    x, y = np.nonzero(solid.any(axis=2))
+    last = values.shape[2] - 1
+    found = []
+    for step, end in ((-1, solid.argmax(axis=2)[x, y]), (1, last - solid[:, :, ::-1].argmax(axis=2)[x, y])):
+        inner, outer = values[x, y, end].astype(float), values[x, y, np.clip(end + step, 0, last)].astype(float)
+        share = np.divide(inner - level, inner - outer, out=np.zeros_like(inner), where=inner > outer)  # none at a cap
+        found.append(np.stack([x, y, end + step * share], axis=1))
+    return np.concatenate(found)
+
+
+def corners(lattice: Lattice) -> Floats:
+    """World positions (8, 3) of the corners of a lattice."""
+    return index_to_world(lattice, np.array(list(np.ndindex(2, 2, 2))) * (np.array(lattice.shape) - 1))
+
+
+def outline_of(scene: Scene, row: Floats) -> Floats:
+    """World points (m, 3) whose hull is that of walls, and of the solids under a row of levels (volumes if none)."""
+    found = []
+    for field, level in zip(scene.fields, row * upward(scene)):
+        values = turned(field.volume, field.inside)[0]
+        for axis in range(3):
+            ends = _column_ends(np.moveaxis(values, axis, 2), level)
+            found.append(index_to_world(field.volume, np.insert(ends[:, :2], axis, ends[:, 2], axis=1)))
+    if not sum(map(len, found)):
+        found = [corners(f.volume) for f in scene.fields]
+    for quad in () if scene.background.any() else scene.quads:  # a room is seen whole, a floor under a sky goes on
+        found.append(quad.corner + np.array([np.zeros(3), quad.edge_u, quad.edge_v, quad.edge_u + quad.edge_v]))
+    return np.concatenate(found)
+
+
+def widest_row(scene: Scene) -> Floats:
+    """Isovalues (F,) under which the solid of every field is largest: those of all other settings lie within."""
+    return np.array([f.range[0] if f.inside == "above" else f.range[1] for f in scene.fields])
+
+
+ZOOM = 1e6  # the largest: beyond it, and below its inverse, nothing is seen, and tangents overflow
+
+
+def fit_camera(scene: Scene, row: Floats, aspect: float, view: View = None, zoom: float = 1.0) -> Camera:
+    """Camera that looks at the solids under one row of levels and just holds them.
+
+    Up is the array axis nearest to world +z, the front the one nearest to -y (the face, in medical coordinates).
+
+    Parameters
+    ----------
+    scene : Scene
+    row : (F,) float64
+        Isovalue of every field.
+    aspect : float
+        Width of the picture over its height.
+    view : str or (azimuth, elevation), optional
+        By default from the front, 30 degrees from the right and 18 from above; what is flat is seen from above, and
+        into a closed scene one looks straight.
+    zoom : float
+        Enlarges the middle of the picture.
+    """
+    outline = outline_of(scene, row)
+    if view is None:
+        extent = np.ptp(outline @ np.stack(upright(scene.fields[0].volume.direction), axis=1), axis=0)
+        flat, closed = extent[2] < 0.5 * extent[:2].min(), not scene.background.any()
+        view = 0.0 if closed else 30.0, 60.0 if flat else 6.0 if closed else 18.0
+    return camera_around(outline, scene.fields[0].volume.direction, aspect, view, zoom)
+
+
+def camera_around(outline: Floats, direction: Floats, aspect: float, view: View, zoom: float = 1.0) -> Camera:
+    """Camera that just holds world points (m, 3), seen from `view` in the axes of an array with this `direction`."""
+    if not 1 / ZOOM <= zoom <= ZOOM:
+        raise BadInput(f"the zoom is {zoom}; expected a positive number up to {ZOOM:g}: 2 shows all twice as large")
+    azimuth, elevation = np.radians(angles("front" if view is None else view))
+    side, front, up = upright(direction)
+    forward = -np.cos(elevation) * (np.cos(azimuth) * front + np.sin(azimuth) * side) - np.sin(elevation) * up
+    right = np.cos(azimuth) * side - np.sin(azimuth) * front
+    up = np.cross(right, forward)
+    return Camera(_eye(outline, right, up, forward, aspect), right, up, forward, HALF_ANGLE / zoom)
+
+
+def _eye(outline: Floats, right: Floats, up: Floats, forward: Floats, aspect: float) -> Floats:
+    """Nearest place from which all of `outline` (m, 3) fits the picture.
+
+    Each point p bounds the eye e: |x| <= aspect (z - e_z) tan and |y| <= (z - e_z) tan, with x and y from the axis of
+    view. The tightest bounds on either side meet at the farthest forward place.
+    """
+    x, y, z = (outline @ np.stack([right, up, forward], axis=1)).T
+    place = []
+    depth = []
+    for across, tangent in ((x, HALF_ANGLE * aspect / MARGIN), (y, HALF_ANGLE / MARGIN)):
+        # across - e <= (z - e_z) tan and e - across <= (z - e_z) tan, with equality for one point each
+        above, below = np.max(across - z * tangent), np.min(across + z * tangent)
+        place.append(0.5 * (above + below))
+        depth.append(0.5 * (below - above) / tangent)
+    return np.asarray(place[0] * right + place[1] * up + min(depth) * forward)

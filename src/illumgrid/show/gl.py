@@ -1,0 +1,140 @@
+"""Pictures by OpenGL without a screen: pyrender on EGL or OSMesa. The only file that imports it.
+
+pyrender 0.1.45 is of 2021 and pins PyOpenGL 3.1.0; what both lack beside a NumPy and a Mesa of today is put right here,
+in `_import`. A process keeps the one platform and the one renderer that it opened first: PyOpenGL chooses its library
+when it is imported, and with EGL the end of one renderer is the end of all.
+"""
+
+import gc
+import os
+import sys
+import types
+import warnings
+from typing import Any
+
+import numpy as np
+
+from illumgrid.field.volume import Floats
+from illumgrid.show.camera import Camera
+from illumgrid.show.meshes import Colored
+from illumgrid.show.shade import Colors
+from illumgrid.tone import decode_srgb, srgb_curve
+
+SIDE = 2  # pixels drawn along each side of one: averaged in linear light, as the software engine does
+LARGEST = 16384 // SIDE  # pixels along a side that common drivers can draw
+PACKAGES = {"egl": "libegl1 libgl1", "osmesa": "libosmesa6"}
+"""Platforms, best first, and the Debian packages that bring their libraries."""
+
+_opened: dict[str, Any] = {}  # at most one: platform to renderer
+_missing: dict[str, str] = {}  # platform to why it cannot be used here
+
+
+def unavailable(platform: str) -> str | None:
+    """Why this platform cannot draw in this process, in some words; None if it can."""
+    if platform not in _opened and platform not in _missing:
+        reason = _open(platform)
+        if reason is not None:
+            _missing[platform] = reason
+    return None if platform in _opened else _missing[platform]
+
+
+def _open(platform: str) -> str | None:
+    if _opened:
+        return f"this process draws by {next(iter(_opened))} already, and one process has one OpenGL"
+    if "OpenGL" in sys.modules:
+        return "another library of this process uses OpenGL already"
+    before = os.environ.get("PYOPENGL_PLATFORM")
+    os.environ["PYOPENGL_PLATFORM"] = platform  # read when OpenGL is imported, and when a renderer is made
+    reason = None
+    try:
+        pyrender = _import(platform)
+        renderer = pyrender.OffscreenRenderer(64, 64)
+        renderer._platform.supports_framebuffers = lambda: True  # OSMesa's have the size of the first picture else
+        _opened[platform] = pyrender, renderer
+    except Exception as error:  # ImportError, AttributeError, EGLError, AssertionError...
+        reason = " ".join(f"{type(error).__name__} {error}".split())[:90]
+    finally:
+        if before is None:
+            del os.environ["PYOPENGL_PLATFORM"]
+        else:
+            os.environ["PYOPENGL_PLATFORM"] = before
+    if reason is not None:
+        _forget()
+    return reason
+
+
+def _forget() -> None:
+    """Let the other platform be tried after this one failed."""
+    gc.collect()
+    for name in [n for n in sys.modules if n.split(".")[0] in ("OpenGL", "pyrender")]:
+        del sys.modules[name]
+
+
+def _import(platform: str) -> Any:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        if not hasattr(np, "infty"):
+            setattr(np, "infty", np.inf)  # noqa: B010  (gone since NumPy 2)
+        # pyrender imports its window, pyglet with it, and with that the libraries of a desktop: none of it is needed.
+        window: Any = types.ModuleType("pyrender.viewer")
+        window.Viewer = None
+        sys.modules[window.__name__] = window
+        try:
+            if platform == "osmesa":
+                _complete_osmesa()
+            import pyrender
+        finally:
+            del sys.modules[window.__name__]
+    return pyrender
+
+
+def _complete_osmesa() -> None:
+    """Give PyOpenGL 3.1.0 what pyrender wants of it: contexts of a chosen version, and ones that can be compared."""
+    import ctypes
+
+    import OpenGL.platform
+    from OpenGL import osmesa
+
+    library = OpenGL.platform.PLATFORM.OSMesa
+    create = library.OSMesaCreateContextAttribs
+    create.restype, create.argtypes = osmesa.OSMesaContext, [ctypes.POINTER(ctypes.c_int), osmesa.OSMesaContext]
+    numbers = {"FORMAT": 0x22, "RGBA": 0x1908, "DEPTH_BITS": 0x30, "PROFILE": 0x33, "CORE_PROFILE": 0x34}
+    for name, number in {**numbers, "CONTEXT_MAJOR_VERSION": 0x36, "CONTEXT_MINOR_VERSION": 0x37}.items():
+        setattr(osmesa, f"OSMESA_{name}", number)
+    osmesa.OSMesaCreateContextAttribs = create
+    current = library.OSMesaGetCurrentContext
+    current.restype = ctypes.c_void_p
+    OpenGL.platform.PLATFORM.GetCurrentContext = current
+    OpenGL.platform.GetCurrentContext = current
+
+
+def draw(parts: list[Colored], camera: Camera, width: int, height: int, background: Colors, platform: str) -> Colors:
+    """Display-linear picture (height, width, 3) of triangles; `unavailable(platform)` said None."""
+    pyrender, renderer = _opened[platform]
+    scene = pyrender.Scene(bg_color=[*map(float, srgb_curve(background)), 1.0])
+    axes = np.stack([camera.right, camera.up, -camera.forward], axis=1)
+    seen = [(part.points - camera.eye) @ axes for part in parts if len(part.faces)]
+    near, far = _depths(seen)
+    for part, points in zip((p for p in parts if len(p.faces)), seen):
+        color = np.concatenate([srgb_curve(part.colors), np.ones((len(points), 1), np.float32)], axis=1)
+        primitive = pyrender.Primitive(
+            positions=(points / far).astype(np.float32), indices=part.faces.astype(np.uint32), color_0=color, mode=4,
+            material=pyrender.MetallicRoughnessMaterial(alphaMode="OPAQUE", baseColorFactor=[1.0, 1.0, 1.0, 1.0]),
+        )  # fmt: skip
+        scene.add(pyrender.Mesh([primitive]))
+    angle = 2 * float(np.arctan(camera.tangent))
+    scene.add(pyrender.PerspectiveCamera(angle, near / far, 1.01, width / height), pose=np.eye(4))
+    renderer.viewport_width, renderer.viewport_height = SIDE * width, SIDE * height
+    flags = pyrender.RenderFlags
+    drawn, _ = renderer.render(scene, flags=flags.FLAT | flags.SKIP_CULL_FACES)
+    linear = decode_srgb(drawn).reshape(height, SIDE, width, SIDE, 3)
+    return np.asarray(linear.mean(axis=(1, 3)), dtype=np.float32)
+
+
+def _depths(seen: list[Floats]) -> tuple[float, float]:
+    """Distances of the near and the far plane that hold all points in front of the camera."""
+    depth = np.concatenate([-p[:, 2] for p in seen]) if seen else np.ones(1)
+    far = float(depth.max())
+    if far <= 0:
+        return 0.5, 1.0
+    return max(float(depth.min()) * 0.99, far * 1e-3), far

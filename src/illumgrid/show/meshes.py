@@ -1,0 +1,84 @@
+"""What a picture shows as coloured triangles, for engines that draw triangles."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from illumgrid.field.levelset import isosurface
+from illumgrid.field.scene import Field
+from illumgrid.field.volume import Floats, outward_normals, world_to_index
+from illumgrid.show.shade import Colors, Shown
+
+WALL_STEPS = 4  # squares along each side of a texel: what is bilinear between texels is then linear to the eye
+
+
+@dataclass(frozen=True, eq=False)
+class Colored:
+    """Triangles without light of their own.
+
+    Parameters
+    ----------
+    points : (n, 3) float64
+        World.
+    faces : (m, 3) int
+    colors : (n, 3) float32
+        Display-linear.
+    """
+
+    points: Floats
+    faces: NDArray[np.integer]
+    colors: Colors
+
+
+def triangles(shown: Shown, eye: Floats) -> list[Colored]:
+    """Surfaces, caps and walls of one setting of the sweep as they are seen from `eye`; walls from their front only."""
+    found = []
+    for number, field in enumerate(shown.scene.fields):
+        found += solid(shown, number, field, eye)
+    for number, quad in enumerate(shown.scene.quads):
+        if (eye - quad.corner) @ quad.normal > 0:
+            found.append(wall(shown, number, eye))
+    return found
+
+
+def solid(shown: Shown, number: int, field: Field, eye: Floats) -> list[Colored]:
+    """The level set of one field, and its caps."""
+    mesh = isosurface(field.volume, float(shown.row[number]), field.inside, capped=True)
+    if not len(mesh.faces):
+        return []
+    points = np.asarray(mesh.vertices)
+    index = world_to_index(field.volume, points)
+    # A cap lies in a face of the volume; the mesh comes there to the last bit, but for a trip through the world.
+    cut = np.zeros(len(mesh.faces), dtype=bool)
+    for axis, last in enumerate(np.array(field.volume.shape) - 1):
+        for plane in (0, last):
+            cut |= (index[:, axis] == plane)[mesh.faces].all(axis=1)
+    facing = np.zeros(len(points))
+    if shown.local or shown.trust:
+        toward = eye - points
+        toward /= np.linalg.norm(toward, axis=1, keepdims=True)
+        normals = outward_normals(field.volume, index, field.inside) @ field.volume.direction.T
+        facing = np.einsum("ij,ij->i", normals, toward)
+    caps = np.tile(shown.cap(number), (len(points), 1))
+    return [
+        Colored(points, mesh.faces[~cut], shown.field(number, points, facing)),
+        Colored(points, mesh.faces[cut], caps),
+    ]
+
+
+def squares(nu: int, nv: int) -> NDArray[np.int64]:
+    """Triangles (m, 3) that join (nu, nv) points in C order into a sheet."""
+    corner = (np.arange(nu - 1)[:, None] * nv + np.arange(nv - 1)).reshape(-1, 1)
+    return np.asarray((corner + np.array([[0, nv, nv + 1, 0, nv + 1, 1]])).reshape(-1, 3))
+
+
+def wall(shown: Shown, number: int, eye: Floats) -> Colored:
+    """One quad, its triangles wound so that the front is theirs."""
+    quad = shown.scene.quads[number]
+    nu, nv = (WALL_STEPS * n + 1 for n in quad.texels)
+    u, v = (x.ravel() for x in np.meshgrid(np.linspace(0, 1, nu), np.linspace(0, 1, nv), indexing="ij"))
+    points = quad.corner + u[:, None] * quad.edge_u + v[:, None] * quad.edge_v
+    toward = eye - points
+    facing = toward @ quad.normal / np.linalg.norm(toward, axis=1)
+    return Colored(points, squares(nu, nv), shown.wall(number, u, v, facing))

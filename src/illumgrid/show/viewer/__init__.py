@@ -1,0 +1,73 @@
+"""The interactive page: isosurfaces marched in the browser's graphics card, lit by the grid; see `page`.
+
+Its source lies in the folder ``page``: JavaScript modules, shaders, one style sheet, put together here as they are.
+"""
+
+import base64
+import gzip
+import html
+import json
+import re
+from functools import cache
+from importlib.resources import files
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from illumgrid.light import Illumination
+
+MODULES = ("numbers", "camera", "state", "sweeps", "hands", "picture", "view")  # each imports from those before it
+SHADERS = ("shared.glsl", "ray.vert", "field.frag", "wall.vert", "wall.frag", "copy.frag")
+
+
+@cache
+def source(name: str) -> str:
+    """Text of one file of the page's source."""
+    return (files("illumgrid.show.viewer") / "page" / name).read_text(encoding="utf-8")
+
+
+def script(last: str) -> str:
+    """The modules, and `last` after them, as one: names are unique, so that imports and exports between them can go."""
+    joined = "\n".join(source(f"{name}.js") for name in (*MODULES, last))
+    joined = re.sub(r"^import .*\n", "", joined, flags=re.MULTILINE)
+    return re.sub(r"^export (?!default)", "", joined, flags=re.MULTILINE)
+
+
+def shaders() -> dict[str, str]:
+    """The shaders by the names of their files, but for what only a reader needs: inside JSON there is none."""
+    return {name: re.sub(r"^ +|^ *//.*\n", "", source(name), flags=re.MULTILINE) for name in SHADERS}
+
+
+def compressed(data: bytes) -> bytes:
+    """The arrays as the page unpacks them; equal data give equal bytes."""
+    return gzip.compress(data, 6, mtime=0)
+
+
+def _json(value: Any) -> str:
+    return json.dumps(value, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
+
+
+def page(light: "Illumination") -> str:
+    """One HTML file that holds everything: it opens from the disk and asks no network for anything.
+
+    Parameters
+    ----------
+    light : Illumination
+
+    Returns
+    -------
+    str
+        The file's text; about the size of the gzipped field and grid, times 4/3, and 60 KB.
+    """
+    from illumgrid.show.viewer.packing import packed
+
+    scene, data = packed(light)
+    parts = {
+        "title": html.escape(scene["title"]) + " · illumgrid",
+        "style": source("view.css"),
+        "markup": source("view.html"),
+        "shaders": _json(shaders()),
+        "scene": _json(scene),
+        "data": base64.b64encode(compressed(data)).decode(),
+        "script": script("page"),
+    }
+    return re.sub(r"\{\{(\w+)\}\}", lambda found: parts[found[1]], source("page.html"))

@@ -1,0 +1,1 @@
+"""Queries and samples: what light transport is asked, and what it answers."""

@@ -1,0 +1,203 @@
+"""The questions put to a light-transport backend, and its answers."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import reduce, wraps
+from typing import Any, TypeVar, cast
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from illumgrid.errors import BadInput
+from illumgrid.field.levelset import upward
+from illumgrid.field.scene import Scene
+from illumgrid.field.volume import Floats, index_to_world, interpolate, outward_normals, project, world_to_index
+
+_Solve = TypeVar("_Solve", bound=Callable[..., "Samples"])
+
+
+@dataclass(frozen=True, eq=False)
+class Queries:
+    """Points that ask for their light, each on the level set of its own row of levels.
+
+    Parameters
+    ----------
+    id : (n,) uint64
+        Unique over a run: the random numbers of a query depend on it and on nothing else that a batch could change.
+    point : (n, 3) float64
+        World positions, on the trilinear level set of the row.
+    normal : (n, 3) float64
+        World unit gradient normals, towards the outside; (0, 0, 0) marks a hole: no light is asked for.
+    level : (n, F) float64
+        The isovalue of every field of the scene while this query is answered.
+    target : (n,) int32
+        Number of the field on whose level set the point lies.
+    """
+
+    id: NDArray[np.uint64]
+    point: Floats
+    normal: Floats
+    level: Floats
+    target: NDArray[np.int32]
+
+    def __len__(self) -> int:
+        return len(self.id)
+
+    def __getitem__(self, rows: slice | NDArray[np.bool_] | NDArray[np.integer]) -> "Queries":
+        return Queries(self.id[rows], self.point[rows], self.normal[rows], self.level[rows], self.target[rows])
+
+    @staticmethod
+    def at(
+        scene: Scene, points: ArrayLike, field: int = 0, level: float | ArrayLike | None = None, first_id: int = 0
+    ) -> "Queries":
+        """Ask at world points (n, 3), each on the level set through itself, or all on `level`.
+
+        Parameters
+        ----------
+        scene : Scene
+        points : (n, 3) array_like
+            World positions.
+        field : int
+            Number of the field on whose level sets the points lie.
+        level : float or (n,) array_like, optional
+            Isovalue, one for all or one each: the points are projected onto that level set by Newton steps along the
+            gradient. The other fields take the isovalue of the same place in the common sweep.
+        first_id : int
+            Id of the first query; the others count up.
+
+        Returns
+        -------
+        Queries
+            A point outside the volume, on a plateau, or more than a cell from its level set is a hole (normal 0).
+        """
+        world = np.asarray(points, dtype=float).reshape(-1, 3)
+        if not 0 <= field < len(scene.fields):
+            raise BadInput(f"field {field} was asked for; expected a number from 0 to {len(scene.fields) - 1}")
+        own = scene.fields[field]
+        index = world_to_index(own.volume, np.where(np.isfinite(world), world, np.nan))  # an infinity is nowhere
+        top = np.array(own.volume.shape) - 1
+        good = np.asarray((np.isfinite(index) & (index >= 0) & (index <= top)).all(axis=1))
+        index = np.where(good[:, None], index, 0.0)
+        if level is None:
+            isovalues = interpolate(own.volume, index)
+        else:
+            isovalues = np.broadcast_to(np.asarray(level, dtype=float), len(world)).copy()
+            index, arrived = project(own.volume, index, isovalues)
+            world = np.where((good & arrived)[:, None], index_to_world(own.volume, index), world)
+            good &= arrived
+        normal = outward_normals(own.volume, index, own.inside) @ own.volume.direction.T
+        return Queries(
+            id=np.arange(first_id, first_id + len(world), dtype=np.uint64),
+            point=world,
+            normal=np.where(good[:, None], normal, 0.0),
+            level=scene.levels_through(field, isovalues),
+            target=np.full(len(world), field, dtype=np.int32),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """Answers: the irradiance at each query, with its own error.
+
+    Parameters
+    ----------
+    queries : Queries
+    mean : (n, 3) float32
+        Irradiance, linear RGB, never clamped: π times the mean worth of a cosine-distributed path.
+    m2 : (n, 3) float32
+        Spread of the mean, as paths (paths - 1) stderr²: for independent paths the sum of squared deviations; here from
+        the differences of paths that share a box of their net, so that it measures noise and not the change of light
+        over the hemisphere, and from what so few paths may have missed.
+    paths : (n,) int32
+        Number of paths; 0 marks a hole, whose mean and m2 are 0.
+    """
+
+    queries: Queries
+    mean: NDArray[np.float32]
+    m2: NDArray[np.float32]
+    paths: NDArray[np.int32]
+
+    def __len__(self) -> int:
+        return len(self.paths)
+
+    def __getitem__(self, rows: slice | NDArray[np.bool_] | NDArray[np.integer]) -> "Samples":
+        return Samples(self.queries[rows], self.mean[rows], self.m2[rows], self.paths[rows])
+
+    @property
+    def stderr(self) -> NDArray[np.float32]:
+        """Standard error (n, 3) of the mean: stderr² = m2 / (paths (paths - 1)); infinite below two paths."""
+        n = self.paths[:, None].astype(float)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.where(n >= 2, np.sqrt(self.m2 / (n * (n - 1))), np.inf).astype(np.float32)
+
+    @property
+    def error(self) -> NDArray[np.float32]:
+        """Root mean square (n,) over RGB of the standard error."""
+        return np.asarray(np.sqrt((self.stderr.astype(float) ** 2).mean(axis=1)), dtype=np.float32)
+
+
+def check_request(paths: range, bounces: int) -> None:
+    """Refuse what no backend can answer.
+
+    Raises
+    ------
+    BadInput
+        On paths that do not count up by one, or bounces below 0.
+    """
+    if not isinstance(paths, range) or paths.step != 1 or paths.start < 0:
+        raise BadInput(f"paths is {paths!r}; expected a range of path numbers from 0 up with step 1, such as range(64)")
+    if bounces < 0:
+        raise BadInput(f"{bounces} bounces were asked for; expected 0 (light straight from the sky) or more")
+
+
+def combine(one: Samples, other: Samples) -> Samples:
+    """Merge the answers of two disjoint ranges of paths to the same queries, as if independent.
+
+    References
+    ----------
+    .. [1] T. F. Chan, G. H. Golub, R. J. LeVeque, "Updating formulae and a pairwise algorithm for computing sample
+           variances", Stanford STAN-CS-79-773, 1979.
+    """
+    if not np.array_equal(one.queries.id, other.queries.id):
+        raise BadInput("the samples to combine answer different queries; expected the same ids in the same order")
+    a, b = one.paths[:, None].astype(float), other.paths[:, None].astype(float)
+    total = np.maximum(a + b, 1.0)
+    apart = other.mean.astype(float) - one.mean
+    mean = one.mean + apart * b / total
+    m2 = one.m2.astype(float) + other.m2 + apart**2 * a * b / total
+    return Samples(one.queries, mean.astype(np.float32), m2.astype(np.float32), one.paths + other.paths)
+
+
+LONGEST = 1 << 16
+"""Paths that a backend of this package follows in one go: it keeps what each is worth."""
+
+
+def in_turn(solve: _Solve) -> _Solve:
+    """Check what is asked of a `Backend.solve`, and have it answer no more than `LONGEST` paths at once."""
+
+    @wraps(solve)
+    def checked(self: Any, scene: Any, queries: Queries, *, paths: range, bounces: int, seed: int) -> Samples:
+        check_request(paths, bounces)
+        parts = [paths[i : i + LONGEST] for i in range(0, len(paths), LONGEST)] or [paths]
+        return reduce(combine, (solve(self, scene, queries, paths=part, bounces=bounces, seed=seed) for part in parts))
+
+    return cast(_Solve, checked)
+
+
+def join_queries(parts: Sequence[Queries]) -> Queries:
+    """One after the other."""
+    return Queries(
+        *(np.concatenate([getattr(p, n) for p in parts]) for n in ("id", "point", "normal", "level", "target"))
+    )
+
+
+def join_samples(parts: Sequence[Samples]) -> Samples:
+    """One after the other."""
+    arrays = (np.concatenate([getattr(p, n) for p in parts]) for n in ("mean", "m2", "paths"))
+    return Samples(join_queries([p.queries for p in parts]), *arrays)
+
+
+def in_frame(scene: Scene, queries: Queries) -> tuple[Floats, Floats, Floats]:
+    """Points (n, 3) and normals (n, 3) of queries in the frame of the scene, and their levels (n, F) turned upward."""
+    axes = scene.fields[0].volume.direction
+    return scene.to_frame(queries.point), queries.normal @ axes, queries.level * upward(scene)

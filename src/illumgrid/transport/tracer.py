@@ -1,0 +1,32 @@
+"""A backend with a scene set up: what a scene costs to prepare is paid once, and owned by whoever holds the tracer."""
+
+from dataclasses import dataclass
+from typing import Protocol, cast
+
+from illumgrid.field.scene import Scene
+from illumgrid.transport.samples import Queries, Samples
+from illumgrid.transport.stages import Backend
+
+
+class Tracer(Protocol):
+    """Answers queries about one scene."""
+
+    def solve(self, queries: Queries, *, paths: range, bounces: int, seed: int) -> Samples:
+        """Trace the paths with these numbers from every query: see `Backend.solve`."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Unprepared:
+    """A backend that has `solve` and nothing to prepare."""
+
+    backend: Backend
+    scene: Scene
+
+    def solve(self, queries: Queries, *, paths: range, bounces: int, seed: int) -> Samples:
+        return self.backend.solve(self.scene, queries, paths=paths, bounces=bounces, seed=seed)
+
+
+def prepare(backend: Backend, scene: Scene) -> Tracer:
+    """Set a scene up for a backend; one that has no method ``prepare`` is asked by its ``solve``."""
+    own = getattr(backend, "prepare", None)
+    return cast(Tracer, own(scene)) if own else _Unprepared(backend, scene)
