@@ -13,6 +13,7 @@ import typer
 
 import illumgrid as ig
 from illumgrid import cli
+from illumgrid.cli import terminal
 from illumgrid.errors import BadInput
 from shapes import ball
 
@@ -129,3 +130,12 @@ def test_a_mistake_of_ours_is_not_dressed_up_as_bad_input():
     with pytest.raises(ZeroDivisionError):
         cli.guarded(lambda: 1 / 0)
     assert cli.guarded(lambda: None) == 0 and cli.guarded(lambda: 3) == 3
+
+
+def test_redirected_output_reports_progress_at_intervals(capsys, monkeypatch):
+    clock = iter([0.0, 1.0, terminal.INTERVAL + 1, terminal.INTERVAL + 1, terminal.INTERVAL + 2])
+    monkeypatch.setattr(terminal.time, "monotonic", lambda: next(clock))
+    with terminal.progress_bars() as progress:
+        for done in (1, 2, 3):
+            progress("bake", done, 4)
+    assert capsys.readouterr().err.splitlines() == ["bake: 50%"]

@@ -56,7 +56,7 @@ def test_view_serves_the_page_until_ctrl_c(folder):
             said = process.communicate(timeout=20)[1]
         finally:
             process.kill()
-    assert process.returncode == 130 and said.strip() == "illumgrid: stopped; nothing was written"
+    assert process.returncode == 0 and not said
 
 
 WINDOW = """

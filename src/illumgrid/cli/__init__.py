@@ -12,7 +12,7 @@ from illumgrid.cli.info import info
 from illumgrid.cli.plugins import plugins
 from illumgrid.cli.preview import preview
 from illumgrid.cli.run import run
-from illumgrid.cli.told import say
+from illumgrid.cli.terminal import say
 from illumgrid.cli.verify import verify
 from illumgrid.cli.view import view
 from illumgrid.errors import BadInput

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from illumgrid.cli.told import heard, say, told_progress
+from illumgrid.cli.terminal import progress_bars, reported_warnings, say
 
 
 def bench(
@@ -38,9 +38,9 @@ def bench(
     given = _input(source, None, limits, None, None)
     folder = output or Path(f"{given.name}-bench")
     store.claim_new(folder)
-    with heard():
+    with reported_warnings():
         scene = given.make(smooth or 0.0)
-        with told_progress() as progress:
+        with progress_bars() as progress:
             preset = (given.preset.grid, given.preset.paths) if given.preset else None
             found = benches.bench(scene, budget, seed, progress, preset)
         files, told = report.files(found, given.name, scene)

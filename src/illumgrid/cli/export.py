@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from illumgrid.cli.told import heard, say, told_progress
+from illumgrid.cli.terminal import progress_bars, reported_warnings, say
 from illumgrid.errors import BadInput
 
 
@@ -39,8 +39,8 @@ def export(
     own = folder / store.EXR
     if file.exists() and own.exists() and file.samefile(own):
         raise BadInput(f"{file} is the run itself; expected another name for the copy")
-    with heard():
+    with reported_warnings():
         light = load(folder)
-        with told_progress() as progress:
+        with progress_bars() as progress:
             told = exports.write(light, file, field, isovalue, on=on, array=array, progress=progress)
     say(f"wrote {file}: {told}")

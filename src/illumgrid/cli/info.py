@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from illumgrid.cli.told import Ignore, heard, told_left_out
+from illumgrid.cli.terminal import Ignore, omitted_light, reported_warnings
 
 if TYPE_CHECKING:
     from illumgrid.field.scene import Quad
@@ -43,7 +43,7 @@ def info(
 
     if inside not in (None, "above", "below"):
         raise BadInput(f"--inside is {inside!r}; expected above or below")
-    with heard(ignore):
+    with reported_warnings(ignore):
         if not store.is_run(source):
             _told_volume(source, limits, "below" if inside == "below" else "above")
         elif limits or inside:
@@ -120,7 +120,7 @@ def _told_run(source: str) -> None:
     )
     typer.echo(
         f"recipe: {names}, {recipe.get('paths')} paths, {recipe.get('bounces')} bounces, seed {recipe.get('seed')}"
-        f"{told_left_out(recipe)}"
+        f"{omitted_light(recipe)}"
     )
     for sentence in recipe.get("warnings", []):
         typer.echo(f"note: {sentence}")

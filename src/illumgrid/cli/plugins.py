@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from illumgrid.cli.told import heard
+from illumgrid.cli.terminal import reported_warnings
 
 if TYPE_CHECKING:
     from illumgrid.registry import Entry
@@ -20,7 +20,7 @@ def plugins() -> None:
     """
     from illumgrid import registry
 
-    with heard():
+    with reported_warnings():
         entries = registry.entries()
     for number, kind in enumerate(registry.KINDS):
         typer.echo(f"{chr(10) * bool(number)}{kind}s (--{kind} NAME)")

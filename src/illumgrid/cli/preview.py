@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from illumgrid.cli.told import say, told_progress
+from illumgrid.cli.terminal import progress_bars, say
 from illumgrid.errors import BadInput
 
 if TYPE_CHECKING:
@@ -159,7 +159,7 @@ def _sweep(
     view, zoom = options.pop("view"), options.pop("zoom")
     options["camera"] = fit_camera(light.scene, widest_row(light.scene), width / height, view, zoom)
     draw = _drawn(light, field, local, split, options)
-    with told_progress() as progress:
+    with progress_bars() as progress:
 
         def told() -> Iterator[Any]:
             for number, picture in enumerate(frames(light, field, count, draw), 1):

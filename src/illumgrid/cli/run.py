@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from illumgrid.cli.told import Ignore, heard, say, told_left_out, told_progress
+from illumgrid.cli.terminal import Ignore, omitted_light, progress_bars, reported_warnings, say
 from illumgrid.errors import BadInput, tell
 
 if TYPE_CHECKING:
@@ -187,7 +187,7 @@ def run(
     from illumgrid.field.lattice import nodes_over
     from illumgrid.io import store
 
-    with heard(ignore) as sentences:
+    with reported_warnings(ignore) as sentences:
         names = {"sampler": sampler, "backend": backend, "interpolator": interpolator}
         stages = _stages(names, settings or [], {"backend.threads": threads, "sampler.count": isovalues})
         given = _input(source, surroundings, limits, inside, albedo)
@@ -204,7 +204,7 @@ def run(
                 tell(finding.name, finding.sentence)
         if backend == "auto":
             say(_why_auto())
-        with told_progress() as progress:
+        with progress_bars() as progress:
             light = light_up(
                 scene, **stages, grid=grid, paths=paths, bounces=bounces, isovalues=isovalues, seed=seed,
                 error=error, seconds=seconds, progress=progress,
@@ -267,7 +267,7 @@ def _told_result(light: "Illumination", folder: Path, seconds: float, picture: b
     if plan:
         for sentence in plan["why"]:
             say(f"  {sentence}")
-    say(f"{recipe['queries']} queries x {recipe['paths']} paths in {seconds:.1f} s{noise}{told_left_out(recipe)}")
+    say(f"{recipe['queries']} queries x {recipe['paths']} paths in {seconds:.1f} s{noise}{omitted_light(recipe)}")
     if reached:
         asked = f"; the pilot said {plan['error']:.2%}" if plan else ""
         say(f"error reached: {reached:.2%} of the mean light{asked}")

@@ -1,11 +1,12 @@
 """``illumgrid view``: sweep the isovalue of a finished run by hand."""
 
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from illumgrid.cli.told import say
+from illumgrid.cli.terminal import say
 from illumgrid.errors import BadInput
 
 
@@ -48,4 +49,5 @@ def view(
             import webbrowser
 
             webbrowser.open(server.address)
-        server.serve_forever()
+        with suppress(KeyboardInterrupt):  # the normal end of a server: exit 0
+            server.serve_forever()

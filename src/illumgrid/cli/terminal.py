@@ -1,5 +1,6 @@
-"""What every command says, and how: one line to the user, warnings as they come, bars with the time left."""
+"""What every command writes to the terminal: single lines, warnings as they occur, progress with the time left."""
 
+import time
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -12,21 +13,23 @@ from illumgrid.errors import WARNINGS, BadInput, IllumgridWarning
 if TYPE_CHECKING:
     from illumgrid.bake import Progress
 
+INTERVAL = 10.0  # seconds between two lines of progress where there is no terminal to draw a bar on
+
 
 def say(text: str) -> None:
-    """One line to the user, not to a pipe."""
+    """Write one line to stderr, so that a pipe carries results only."""
     typer.echo(text, err=True)
 
 
 Ignore = Annotated[
     list[str] | None,
-    typer.Option("--ignore", metavar="NAME", help="Warning not to be told, such as noise; repeatable."),
+    typer.Option("--ignore", metavar="NAME", help="Silence a warning by name, e.g. noise (repeatable)."),
 ]
 
 
 @contextmanager
-def heard(ignored: Sequence[str] | None = None) -> Iterator[list[str]]:
-    """Collect the package's warnings as sentences, and say each, but for those with `ignored` names."""
+def reported_warnings(ignored: Sequence[str] | None = None) -> Iterator[list[str]]:
+    """Write each warning of the package as a note, except those with `ignored` names, and collect the sentences."""
     for name in ignored or ():
         if name not in WARNINGS:
             raise BadInput(f"--ignore got {name!r}; expected the name of a warning: {', '.join(WARNINGS)}")
@@ -44,28 +47,42 @@ def heard(ignored: Sequence[str] | None = None) -> Iterator[list[str]]:
 
 
 @contextmanager
-def told_progress() -> Iterator["Progress"]:
-    """A bar with the time left, for work that takes longer than a moment."""
+def progress_bars() -> Iterator["Progress"]:
+    """Progress of long work: a bar with the time left on a terminal, elsewhere a line every `INTERVAL` seconds."""
     from rich.console import Console
+
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        yield _progress_lines()
+        return
     from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
     bars: dict[str, Any] = {}
-    console = Console(stderr=True)
-    with Progress(
-        TextColumn("{task.description:<6}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn(),
-        console=console, transient=True, disable=not console.is_terminal,
-    ) as progress:  # fmt: skip
+    columns = TextColumn("{task.description:<6}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn()
+    with Progress(*columns, console=console, transient=True) as progress:
 
-        def tell(what: str, done: int, total: int) -> None:
+        def report(what: str, done: int, total: int) -> None:
             if what not in bars:
                 bars[what] = progress.add_task(what, total=max(total, 1))
             progress.update(bars[what], completed=done)
 
-        yield tell
+        yield report
 
 
-def told_left_out(recipe: Mapping[str, Any]) -> str:
-    """What the bounces left out would add, as the end of a sentence; empty where nobody estimated it."""
+def _progress_lines() -> "Progress":
+    last = time.monotonic()
+
+    def report(what: str, done: int, total: int) -> None:
+        nonlocal last
+        if time.monotonic() - last >= INTERVAL:
+            last = time.monotonic()
+            say(f"{what}: {done / max(total, 1):.0%}")
+
+    return report
+
+
+def omitted_light(recipe: Mapping[str, Any]) -> str:
+    """How much light the truncated bounces omit, as the end of a sentence; empty where no estimate exists."""
     left = recipe.get("left_out")
     if left is None:
         return ""
