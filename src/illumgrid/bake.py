@@ -110,8 +110,8 @@ def holes_within_range(scene: Scene, field: int, grid: IlluminationGrid) -> int:
         if number != field:
             index = world_to_index(other.volume, nodes)
             within = ((index >= 0) & (index <= np.array(other.volume.shape) - 1)).all(axis=1)
-            depth = interpolate(other.volume, index) - scene.levels_through(field, level)[:, number]
-            seen &= ~(within & ((depth >= 0) if other.inside == "above" else (depth <= 0)))
+            value = interpolate(other.volume, index)
+            seen &= ~(within & other.solid(value, scene.levels_through(field, level)[:, number]))
     return int(seen.sum())
 
 

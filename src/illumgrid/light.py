@@ -67,7 +67,7 @@ class Illumination:
         (n, 3) uint8
             sRGB of albedo/π · E · exposure.
         """
-        number = 0 if field is None else self.scene.number_of(field)
+        number = self.scene.number_of(field)
         radiance = self.grids[number].lookup(points) * self.scene.fields[number].material.albedo / np.pi
         return tone.encode_srgb(radiance * (self.exposure if exposure is None else exposure))
 

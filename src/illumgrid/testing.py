@@ -221,8 +221,8 @@ class BackendTests(_StageTests):
         asked = replace(asked, normal=np.where(blind[:, None], 0.0, asked.normal))
         buried = np.zeros(len(asked), bool)
         for number, field in enumerate(scene.fields):
-            depth = interpolate(field.volume, world_to_index(field.volume, asked.point)) - asked.level[:, number]
-            buried |= (asked.target != number) & ((depth if field.inside == "above" else -depth) > 0.1)
+            value = interpolate(field.volume, world_to_index(field.volume, asked.point))
+            buried |= (asked.target != number) & field.solid(value, asked.level[:, number] + 0.1 * field.upward)
         assert buried.any() and not (blind | buried).all()
         holes = self.solve(asked, 2)[blind | buried]
         marked = not holes.paths.any() and not holes.mean.any() and np.isinf(holes.stderr).all()

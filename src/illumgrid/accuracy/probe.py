@@ -18,6 +18,7 @@ from illumgrid.accuracy.truth import Truth, begin, converge, enough, trace, unse
 from illumgrid.errors import BadInput
 from illumgrid.field.scene import Scene
 from illumgrid.field.volume import Floats, world_to_index
+from illumgrid.field.volume import corners as corners_of
 from illumgrid.grid import GridSpec
 from illumgrid.interpolators.nearest import Nearest
 from illumgrid.samplers.direct import at_nodes, reachable
@@ -73,13 +74,10 @@ def corners(scene: Scene, longest: int, points: Queries) -> Corners:
     for number, spec in enumerate(specs_of(scene, longest)):
         nodes += len(reachable(scene.fields[number], spec))
         own = np.flatnonzero(points.target == number)
-        index = np.clip(world_to_index(spec, points.point[own]), 0, np.array(spec.shape) - 1)
-        cell = np.minimum(np.floor(index).astype(np.int64), np.array(spec.shape) - 2)
-        corner = np.array(list(np.ndindex(2, 2, 2)))
-        share = np.where(corner[None], (index - cell)[:, None], 1 - (index - cell)[:, None])
-        flat = np.ravel_multi_index(tuple(np.moveaxis(cell[:, None] + corner[None], 2, 0)), spec.shape)
+        around, share = zip(*corners_of(spec, world_to_index(spec, points.point[own])))
+        flat = np.stack([np.ravel_multi_index(tuple(node.T), spec.shape) for node in around], axis=1)
         unique, place = np.unique(flat, return_inverse=True)
-        row[own], weight[own] = first + place.reshape(flat.shape), share.prod(axis=2)
+        row[own], weight[own] = first + place.reshape(flat.shape), np.stack(share, axis=1)
         parts.append(at_nodes(scene, number, spec, unique))
         first += len(unique)
     return Corners(join_queries(parts), row, weight, nodes)

@@ -136,7 +136,7 @@ def unseen_in_volume(scene: Scene, points: int, seed: int) -> Queries:
         tried = np.searchsorted(upto, random.random(max(1 << 15, 64 * points)) * upto[-1]).clip(0, len(cells) - 1)
         shape = tuple(n - 1 for n in field.volume.shape)
         index = np.stack(np.unravel_index(cells[tried], shape), axis=1) + random.random((len(tried), 3))
-        share = (interpolate(field.volume, index) - field.range[0]) / (field.range[1] - field.range[0])
+        share = field.place(interpolate(field.volume, index))
         kept = (share >= 0) & (share <= 1)
         index, step = index[kept], np.minimum(share[kept] * _STEPS, _STEPS - 1).astype(int)
         weight = np.linalg.norm(cell_gradient(field.volume, index), axis=1) / chance[tried[kept]]

@@ -125,7 +125,7 @@ def _check(
 
 
 def _told_outside(light: "Illumination", field: str | None, isovalue: float | None) -> None:
-    number = 0 if field is None else light.scene.number_of(field)
+    number = light.scene.number_of(field)
     if isovalue is not None:
         low, high = light.scene.fields[number].range
         if not low <= isovalue <= high:

@@ -149,8 +149,7 @@ def critical_isovalues(field: Field) -> list[tuple[float, str]]:
     """
     small = _reduced(field.volume, _SIDE)
     levels = np.linspace(field.range[0], field.range[1], _LEVELS)
-    sign = 1.0 if field.inside == "above" else -1.0
-    numbers = [topology(sign * small.values >= sign * level) for level in levels]
+    numbers = [topology(field.solid(small.values, level)) for level in levels]
     found = []
     for k in range(1, _LEVELS - 2):
         before, after = numbers[k - 1 : k + 1], numbers[k + 1 : k + 3]
@@ -220,8 +219,8 @@ def _thin(field: Field, spec: GridSpec) -> Iterator[Finding]:
         return
     inward = -outward_normals(volume, index, field.inside)
     # Two nodes deeper a thick solid is still solid.
-    depth = interpolate(volume, index + 2 * spec.spacing.max() * inward / volume.spacing) - middle
-    lost = float(((depth < 0) if field.inside == "above" else (depth > 0)).mean())
+    deeper = interpolate(volume, index + 2 * spec.spacing.max() * inward / volume.spacing)
+    lost = float((~field.solid(deeper, middle)).mean())
     if lost > _THIN:
         longest, enough = max(spec.shape), max(volume.shape)
         todo = f"--grid {enough} puts a node on every voxel" if longest < enough else "resample the volume finer"
@@ -233,22 +232,20 @@ def _thin(field: Field, spec: GridSpec) -> Iterator[Finding]:
 
 
 def _border(field: Field) -> Iterator[Finding]:
-    low, high = field.range
-    loosest = low if field.inside == "above" else high
     faces, touched, total = [], 0, 0
     for axis, letter in enumerate("xyz"):
         for end, side in ((0, "first"), (-1, "last")):
             plane = np.take(field.volume.values, end, axis=axis)
-            met = int(np.count_nonzero(plane >= loosest if field.inside == "above" else plane <= loosest))
+            met = int(np.count_nonzero(field.solid(plane, field.widest)))
             touched, total = touched + met, total + plane.size
             if met:
                 faces.append(f"the {side} {letter}")
     if touched > _TOUCHED * total:
         yield Finding(
             "border",
-            f"at {loosest:.4g} the solid of field {field.name!r} meets the volume's border ({', '.join(faces)} plane, "
-            f"{_below(touched / total)} of the border), where it is cut and closed by a plain cap; take a larger "
-            "crop, or a --range farther inside",
+            f"at {field.widest:.4g} the solid of field {field.name!r} meets the volume's border ({', '.join(faces)} "
+            f"plane, {_below(touched / total)} of the border), where it is cut and closed by a plain cap; take a "
+            "larger crop, or a --range farther inside",
         )
 
 

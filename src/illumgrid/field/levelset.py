@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from illumgrid.errors import BadInput
 from illumgrid.field.bricks import Bricks, lay_bricks
 from illumgrid.field.scene import Scene
-from illumgrid.field.volume import Floats, Side, Volume, index_to_world
+from illumgrid.field.volume import UPWARD, Floats, Side, Volume, index_to_world
 
 if TYPE_CHECKING:
     import trimesh
@@ -23,7 +23,7 @@ def off_the_data(volume: Volume, isovalue: float, inside: Side) -> float:
     level = np.float32(isovalue)
     if not (volume.values == level).any():
         return float(isovalue)
-    return float(np.nextafter(level, np.float32(-np.inf if inside == "above" else np.inf)))
+    return float(np.nextafter(level, np.float32(-np.inf * UPWARD[inside])))
 
 
 def isosurface(volume: Volume, isovalue: float, inside: Side = "above", capped: bool = False) -> "trimesh.Trimesh":
@@ -52,7 +52,7 @@ def isosurface(volume: Volume, isovalue: float, inside: Side = "above", capped: 
 
     if not np.isfinite(isovalue):
         raise BadInput(f"the isovalue is {isovalue}; expected a finite number")
-    if inside not in ("above", "below"):
+    if inside not in UPWARD:
         raise BadInput(f"inside is {inside!r}; expected 'above' or 'below'")
     index, faces = extract(volume, isovalue, inside, capped)
     if np.linalg.det(volume.direction) < 0:
@@ -124,7 +124,7 @@ def turned(volume: Volume, inside: Side) -> tuple[NDArray[np.float32], Bricks]:
     """Values with the solid upwards, and their bricks; built once for each volume and side."""
     known = _turned.setdefault(volume, {})
     if inside not in known:
-        values = volume.values if inside == "above" else -volume.values
+        values = volume.values if UPWARD[inside] > 0 else -volume.values
         known[inside] = values, lay_bricks(values)
     return known[inside]
 
@@ -187,4 +187,4 @@ def _quads_in_frame(scene: Scene) -> dict[str, NDArray[Any]]:
 
 def upward(scene: Scene) -> Floats:
     """+1 or -1 for each field (F,): what turns h and its isovalues so that the solid is upwards."""
-    return np.array([1.0 if f.inside == "above" else -1.0 for f in scene.fields])
+    return np.array([field.upward for field in scene.fields])

@@ -3,10 +3,10 @@
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from illumgrid.errors import BadInput
-from illumgrid.field.volume import Floats, Side, Volume, finite, index_to_world
+from illumgrid.field.volume import UPWARD, Floats, Side, Volume, finite, index_to_world
 
 
 def _rgb(value: ArrayLike, name: str, at_most: float) -> Floats:
@@ -73,7 +73,7 @@ def suggest_range(volume: Volume, inside: Side = "above") -> tuple[float, float,
     depth = 0.5 * (edges[1:] + edges[:-1])
     if inside == "below":
         counts, depth = counts[::-1], -depth[::-1]
-    sign = 1.0 if inside == "above" else -1.0
+    sign = UPWARD[inside]
     threshold = float(threshold_otsu(hist=(counts, depth)))
     within = np.where(depth > threshold, counts, 0)
     # The bin at which half of the object is passed; at least one bin deeper than the threshold.
@@ -84,7 +84,7 @@ def suggest_range(volume: Volume, inside: Side = "above") -> tuple[float, float,
     low, high = sorted((sign * threshold, sign * deep))
     why = (
         f"Otsu's threshold {sign * threshold:.4g} parts the object ({share:.1%} of the voxels) from the background, "
-        f"and half of the object lies {'above' if inside == 'above' else 'below'} {sign * deep:.4g}"
+        f"and half of the object lies {inside} {sign * deep:.4g}"
     )
     return low, high, why
 
@@ -114,7 +114,7 @@ class Field:
     def __post_init__(self) -> None:
         if not (isinstance(self.name, str) and self.name and self.name.isprintable()):
             raise BadInput(f"a field's name is {self.name!r}; expected a printable text")
-        if self.inside not in ("above", "below"):
+        if self.inside not in UPWARD:
             raise BadInput(f"inside of field {self.name!r} is {self.inside!r}; expected 'above' or 'below'")
         volume = finite(self.volume, self.inside)
         asked = suggest_range(volume, self.inside)[:2] if self.range is None else self.range
@@ -133,6 +133,25 @@ class Field:
         limits.setflags(write=False)
         object.__setattr__(self, "volume", volume)
         object.__setattr__(self, "range", limits)
+
+    @property
+    def upward(self) -> float:
+        """+1 or -1: what turns h and its isovalues so that the solid is where values are high."""
+        return UPWARD[self.inside]
+
+    @property
+    def widest(self) -> float:
+        """Isovalue of the range whose solid is largest: those of all others lie within it."""
+        return float(self.range[0] if self.upward > 0 else self.range[1])
+
+    def solid(self, values: ArrayLike, isovalues: ArrayLike) -> NDArray[np.bool_]:
+        """Whether points with these values of h lie in the solids of these isovalues."""
+        return np.asarray(self.upward * np.asarray(values) >= self.upward * np.asarray(isovalues))
+
+    def place(self, isovalues: ArrayLike) -> Floats:
+        """Place of isovalues in the sweep: 0 at the low end of the range, 1 at the high end, not clamped."""
+        low, high = self.range
+        return np.asarray((np.asarray(isovalues, float) - low) / (high - low))
 
 
 @dataclass(frozen=True, eq=False)
@@ -291,8 +310,7 @@ class Scene:
     def levels_through(self, field: int, isovalues: ArrayLike) -> Floats:
         """Settings (n, F) with field number `field` at `isovalues` (n,), the others as the common sweep has them."""
         own = np.atleast_1d(np.asarray(isovalues, float))
-        low, high = self.fields[field].range
-        rows = self.levels((own - low) / (high - low))
+        rows = self.levels(self.fields[field].place(own))
         rows[:, field] = own
         return rows
 
@@ -307,8 +325,8 @@ class Scene:
         first = self.fields[0].volume
         return first.origin + np.asarray(points, float) @ first.direction.T
 
-    def number_of(self, name: str) -> int:
-        """Position of the field with this name.
+    def number_of(self, name: str | None) -> int:
+        """Position of the field with this name; None means the first.
 
         Raises
         ------
@@ -316,6 +334,8 @@ class Scene:
             If no field has it.
         """
         names = [f.name for f in self.fields]
+        if name is None:
+            return 0
         if name not in names:
             raise BadInput(f"no field is named {name!r}; expected one of {', '.join(names)}")
         return names.index(name)

@@ -3,6 +3,7 @@
 Between its voxels a volume is trilinear. Every level set in this package is one of the trilinear interpolant.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol
 
@@ -13,6 +14,9 @@ from illumgrid.errors import BadInput, tell
 
 Floats = NDArray[np.float64]
 Side = Literal["above", "below"]
+
+UPWARD: dict[Side, float] = {"above": 1.0, "below": -1.0}
+"""The sign that turns a field so that its solid is where values are high: the solid of c is {UPWARD h >= UPWARD c}."""
 
 ON_A_VOXEL = 1e-7
 """Index coordinates this close to an integer are that integer: a node on a voxel stays one after a trip through world
@@ -139,7 +143,7 @@ def finite(volume: Volume, inside: Side) -> Volume:
     if good.all():
         return volume
     low, high = volume.values[good].min(), volume.values[good].max()
-    outermost = low if inside == "above" else high
+    outermost = low if UPWARD[inside] > 0 else high
     bad = int(good.size - good.sum())
     where = np.unravel_index(int(np.argmin(good)), volume.shape)
     tell(
@@ -169,6 +173,18 @@ def cells(volume: Lattice, index: Floats) -> tuple[NDArray[np.int64], Floats]:
     return cell, np.clip(index - cell, 0.0, 1.0)
 
 
+def corners(lattice: Lattice, index: Floats) -> Iterator[tuple[NDArray[np.int64], Floats]]:
+    """The eight lattice points (n, 3) around fractional indices (n, 3), one by one, with trilinear weights (n,)."""
+    cell, f = cells(lattice, index)
+    for corner in np.ndindex(2, 2, 2):
+        yield cell + corner, np.where(corner, f, 1 - f).prod(axis=1)
+
+
+def box_corners(lattice: Lattice) -> Floats:
+    """World positions (8, 3) of the outermost points of a lattice."""
+    return index_to_world(lattice, np.array(list(np.ndindex(2, 2, 2))) * (np.array(lattice.shape) - 1))
+
+
 def interpolate(volume: Volume, index: Floats) -> Floats:
     """Trilinear value (n,) at fractional indices (n, 3); beyond the border, that of the border."""
     from scipy.ndimage import map_coordinates
@@ -191,12 +207,9 @@ def cell_gradient(volume: Volume, index: Floats) -> Floats:
 
 def smooth_gradient(volume: Volume, index: Floats) -> Floats:
     """Central differences (one-sided at the border), interpolated: (n, 3), per world unit, along the volume's axes."""
-    cell, f = cells(volume, index)
     top = np.array(volume.shape) - 1
     result = np.zeros((len(index), 3))
-    for corner in np.ndindex(2, 2, 2):
-        voxel = cell + corner
-        weight = np.where(corner, f, 1 - f).prod(axis=1)
+    for voxel, weight in corners(volume, index):
         for axis in range(3):
             after, before = voxel.copy(), voxel.copy()
             after[:, axis] = np.minimum(voxel[:, axis] + 1, top[axis])
@@ -215,8 +228,7 @@ def outward_normals(volume: Volume, index: Floats, inside: Side) -> Floats:
     flat = ~gradient.any(axis=1)
     if flat.any():
         gradient[flat] = cell_gradient(volume, index[flat])
-    if inside == "above":
-        gradient = -gradient
+    gradient *= -UPWARD[inside]
     # Scale first: the square of a tiny gradient would underflow.
     largest = np.abs(gradient).max(axis=1, keepdims=True, initial=0.0)
     gradient = gradient / np.where(largest > 0, largest, 1.0)

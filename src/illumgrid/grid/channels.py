@@ -1,4 +1,4 @@
-"""Channels of light: light is linear, so grids and samples carry as many channels as a scene needs, and mix them to RGB."""
+"""Channels of light: light is linear, so grids and samples carry as many as a scene needs, and mix them to RGB."""
 
 from dataclasses import dataclass
 

@@ -79,8 +79,7 @@ def critical_values(field: Field) -> tuple[Floats, NDArray[np.int64]]:
     isovalue passes, changes its Euler characteristic by the alternating sum of the cells that it completes: 0 unless
     it is critical. Equal values take turns by their place in the array, so that a plateau is one step, not many.
     """
-    turned = field.volume.values if field.inside == "above" else -field.volume.values
-    values = np.pad(turned, 1, constant_values=-np.inf)
+    values = np.pad(field.upward * field.volume.values, 1, constant_values=-np.inf)
     within = (field.volume.values >= field.range[0]) & (field.volume.values <= field.range[1])
     own = np.flatnonzero(np.pad(within, 1))
     stride = np.array([values.shape[1] * values.shape[2], values.shape[2], 1])
@@ -97,7 +96,7 @@ def critical_values(field: Field) -> tuple[Floats, NDArray[np.int64]]:
             corners = around[np.ix_(*([1, 1 + s] if s else [1] for s in step))].reshape(-1, len(voxel))
             change[first : first + _CELLS] += (-1) ** np.count_nonzero(step) * corners.all(axis=0)
     critical = change != 0
-    return flat[own[critical]].astype(float) * (1 if field.inside == "above" else -1), change[critical]
+    return flat[own[critical]].astype(float) * field.upward, change[critical]
 
 
 def adaptive_rows(scene: Scene, count: int, topology: float = TOPOLOGY) -> Floats:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from illumgrid.errors import BadInput
 from illumgrid.field.levelset import turned, upward
 from illumgrid.field.scene import Scene, upright
-from illumgrid.field.volume import Floats, Lattice, index_to_world
+from illumgrid.field.volume import Floats, box_corners, index_to_world
 
 HALF_ANGLE = 0.27  # tangent of half the vertical angle of view, 30 degrees in all
 MARGIN = 1.08  # the picture is this much larger than what it holds
@@ -77,11 +77,6 @@ def _column_ends(values: NDArray[np.float32], level: float) -> Floats:
     return np.concatenate(found)
 
 
-def corners(lattice: Lattice) -> Floats:
-    """World positions (8, 3) of the corners of a lattice."""
-    return index_to_world(lattice, np.array(list(np.ndindex(2, 2, 2))) * (np.array(lattice.shape) - 1))
-
-
 def outline_of(scene: Scene, row: Floats) -> Floats:
     """World points (m, 3) whose hull is that of walls, and of the solids under a row of levels (volumes if none)."""
     found = []
@@ -91,7 +86,7 @@ def outline_of(scene: Scene, row: Floats) -> Floats:
             ends = _column_ends(np.moveaxis(values, axis, 2), level)
             found.append(index_to_world(field.volume, np.insert(ends[:, :2], axis, ends[:, 2], axis=1)))
     if not sum(map(len, found)):
-        found = [corners(f.volume) for f in scene.fields]
+        found = [box_corners(f.volume) for f in scene.fields]
     for quad in () if scene.background.any() else scene.quads:  # a room is seen whole, a floor under a sky goes on
         found.append(quad.corner + np.array([np.zeros(3), quad.edge_u, quad.edge_v, quad.edge_u + quad.edge_v]))
     return np.concatenate(found)
@@ -99,7 +94,7 @@ def outline_of(scene: Scene, row: Floats) -> Floats:
 
 def widest_row(scene: Scene) -> Floats:
     """Isovalues (F,) under which the solid of every field is largest: those of all other settings lie within."""
-    return np.array([f.range[0] if f.inside == "above" else f.range[1] for f in scene.fields])
+    return np.array([field.widest for field in scene.fields])
 
 
 ZOOM = 1e6  # the largest: beyond it, and below its inverse, nothing is seen, and tangents overflow

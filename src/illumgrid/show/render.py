@@ -8,9 +8,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from illumgrid.errors import BadInput
+from illumgrid.field.volume import box_corners
 from illumgrid.show import gl, meshes, software
 from illumgrid.show.block import Block
-from illumgrid.show.camera import VIEWS, Camera, View, camera_around, corners, fit_camera, widest_row
+from illumgrid.show.camera import VIEWS, Camera, View, camera_around, fit_camera, widest_row
 from illumgrid.show.shade import BACKGROUND, CAP_TONE, Colors, Shown
 from illumgrid.show.trust import scale
 from illumgrid.tone import decode_srgb, encode_srgb
@@ -119,10 +120,9 @@ def render(
     below = [scale(light, width, height, encode_srgb(sheet.background))] if trust else []
     sheet = replace(sheet, height=height - sum(map(len, below)))
     scene = light.scene
-    number = 0 if field is None else scene.number_of(field)
+    number = scene.number_of(field)
     row = scene.levels(0.5)[0] if isovalue is None else scene.levels_through(number, isovalue)[0]
-    low, high = scene.fields[number].range
-    shown = Shown(light, row, float(np.clip((row[number] - low) / (high - low), 0.0, 1.0)), local, trust)
+    shown = Shown(light, row, float(np.clip(scene.fields[number].place(row[number]), 0.0, 1.0)), local, trust)
     if camera is None:
         camera = fit_camera(scene, row, sheet.width / sheet.height, view, zoom)
     return np.concatenate([encode_srgb(_drawn(shown, camera, sheet, drawn_by)), *below])
@@ -154,9 +154,9 @@ def grid_volume(
     """
     drawn_by, _ = choose_engine(engine)
     sheet = _Sheet(width, height, _background(background))
-    number = 0 if field is None else light.scene.number_of(field)
+    number = light.scene.number_of(field)
     spec = light.grids[number].spec
-    camera = camera_around(corners(spec), spec.direction, width / height, view or (30.0, 24.0), zoom)
+    camera = camera_around(box_corners(spec), spec.direction, width / height, view or (30.0, 24.0), zoom)
     shown = Shown(light, light.scene.levels(0.5)[0], 0.5, local=False)
     block, paper = Block(shown, number, camera.eye, cut), (sheet.width, sheet.height, sheet.background)
     if drawn_by == "software":

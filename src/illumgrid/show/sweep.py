@@ -24,7 +24,7 @@ ENDINGS = (".gif", ".webp", ".mp4")
 def frames(light: "Illumination", field: str | None, count: int, draw: Callable[[float], Picture]) -> Iterator[Picture]:
     """`count` pictures by `draw`, called with equal steps of the isovalue of `field` through its range."""
     scene = light.scene
-    number = 0 if field is None else scene.number_of(field)
+    number = scene.number_of(field)
     for row in scene.levels(np.linspace(0.0, 1.0, count)):
         yield labelled(draw(float(row[number])), isovalues_of(scene, row))
 

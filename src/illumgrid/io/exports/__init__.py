@@ -93,7 +93,7 @@ def write(
         surface, or a file that cannot be written.
     """
     check(path, isovalue, on, array)
-    number = 0 if field is None else light.scene.number_of(field)
+    number = light.scene.number_of(field)
     ending = Path(path).suffix.lower()
     if ending in SURFACES:
         lit = surface.lit(light, number, isovalue, progress)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from illumgrid.field.volume import Floats, Lattice, cells, index_to_world, interpolate, world_to_index
+from illumgrid.field.volume import Floats, Lattice, corners, index_to_world, interpolate, world_to_index
 from illumgrid.tone import encode_srgb
 
 if TYPE_CHECKING:
@@ -93,12 +93,9 @@ def certainty(grid: "IlluminationGrid", world: Floats) -> tuple[NDArray[np.float
     The error is their weighted mean, which holds however the nodes' errors hang together, and infinite where a node
     has none; the support is the smallest.
     """
-    index = np.clip(world_to_index(grid.spec, world), 0, np.array(grid.spec.shape) - 1)
-    cell, f = cells(grid.spec, index)
     error, support = np.zeros(len(world), np.float32), np.full(len(world), np.inf, np.float32)
-    for corner in np.ndindex(2, 2, 2):
-        weight = np.where(corner, f, 1 - f).prod(axis=1).astype(np.float32)
-        node = tuple((cell + corner).T)
+    for corner, share in corners(grid.spec, world_to_index(grid.spec, world)):
+        node, weight = tuple(corner.T), share.astype(np.float32)
         mixed = weight > 0
         error[mixed] += weight[mixed] * grid.error[node][mixed]
         support[mixed] = np.minimum(support, grid.support[node])[mixed]

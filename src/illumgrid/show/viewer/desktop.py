@@ -63,8 +63,7 @@ class Window:
         """Extract the isosurfaces at this setting of the sweep, look their light up, and show them."""
         scene = self.light.scene
         row = scene.levels_through(0, isovalue)[0]
-        low, high = scene.fields[0].range
-        shown = Shown(self.light, row, float(np.clip((isovalue - low) / (high - low), 0.0, 1.0)), False)
+        shown = Shown(self.light, row, float(np.clip(scene.fields[0].place(isovalue), 0.0, 1.0)), False)
         eye = np.asarray(self.plotter.camera.position, float)
         solids = [piece for k, field in enumerate(scene.fields) for piece in solid(shown, k, field, eye)]
         walls = [wall(shown, k, eye) for k in range(len(scene.quads))]

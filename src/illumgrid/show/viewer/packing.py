@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from illumgrid.field.levelset import turned, upward
+from illumgrid.field.levelset import turned
 from illumgrid.field.scene import Field, Scene, upright
-from illumgrid.field.volume import Floats, Lattice, Volume, index_to_world
+from illumgrid.field.volume import Floats, Lattice, Volume, box_corners, index_to_world
 from illumgrid.grid import GridSpec, IlluminationGrid
 from illumgrid.show.camera import HALF_ANGLE, fit_camera, outline_of
 from illumgrid.show.shade import BACKGROUND, CAP_TONE
@@ -43,9 +43,8 @@ class Stage:
     @classmethod
     def of(cls, scene: Scene) -> "Stage":
         """The stage that holds the fields."""
-        corners = np.array(list(np.ndindex(2, 2, 2)))
-        world = [index_to_world(f.volume, corners * (np.array(f.volume.shape) - 1)) for f in scene.fields]
-        low, high = np.min(np.concatenate(world), axis=0), np.max(np.concatenate(world), axis=0)
+        world = np.concatenate([box_corners(f.volume) for f in scene.fields])
+        low, high = world.min(axis=0), world.max(axis=0)
         return cls((low + high) / 2, float((high - low).max()))
 
     def place(self, world: Floats) -> Floats:
@@ -151,7 +150,7 @@ def _histogram(field: Field) -> dict[str, Any]:
 def _field(light: "Illumination", number: int, stage: Stage, into: Bytes, notes: list[str]) -> dict[str, Any]:
     field, whole, grid = light.scene.fields[number], light.grids[number], _thinned(light.grids[number])
     volume = reduced(field.volume, MOST_VOXELS)
-    sign = float(upward(light.scene)[number])
+    sign = field.upward
     ends = sorted(sign * field.range)
     steps, base, step, clamped = field_steps(turned(volume, field.inside)[0], (ends[0], ends[1]))
     for what, before, after in (
