@@ -1,19 +1,22 @@
-"""The chain: ask, answer, fill. No disk, no names of stages, no screen."""
+"""The chain: ask, answer, combine, fill. No disk, no names of stages, no screen."""
 
 import time
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
+from illumgrid.errors import BadInput
 from illumgrid.field.scene import Levels, Quad, Scene
 from illumgrid.field.volume import interpolate, world_to_index
 from illumgrid.grid import GridSpec, IlluminationGrid, WallTexture, fill_holes
 from illumgrid.samplers.direct import Direct, reachable
 from illumgrid.stages import Backend, Interpolator, Sampler
 from illumgrid.transport.samples import Queries, Samples, combine, join_queries, join_samples
+from illumgrid.transport.tracer import Tracer, prepare
 
 Progress = Callable[[str, int, int], None]
 """Called with what is being done, how much of it is done, and how much there is."""
@@ -24,6 +27,116 @@ class Map(Protocol):
 
     def __call__(self, function: Callable[[Any], Any], work: Iterable[Any], /) -> Iterable[Any]:
         """Apply `function` to each piece of `work`."""
+
+
+QUERY_ARRAYS = tuple(f.name for f in fields(Queries))
+SAMPLE_ARRAYS = tuple(f.name for f in fields(Samples) if f.name != "queries")
+
+
+def shifted_seed(seed: int, shift: int) -> int:
+    """Another seed, `shift` further on, within the 64 bits that a seed has."""
+    return (seed + shift) % 2**64
+
+
+def _answer(tracer: Tracer, bounces: int, seed: int, work: tuple[Queries, range]) -> Samples:
+    return tracer.solve(work[0], paths=work[1], bounces=bounces, seed=seed)
+
+
+@dataclass(frozen=True, eq=False)
+class Bake:
+    """Light at some targets and the paths it comes from: walks more paths, combines, and can be stored.
+
+    Parameters
+    ----------
+    targets : tuple of Queries
+        Batches of nodes, texels or points.
+    weights : tuple of int
+        Paths from each target of a batch for every path of a walk: 1, or `texel_paths` for texels.
+    bounces, seed : int
+    answers : tuple of Samples
+        Moments of the light, one a batch; empty before the first walk.
+    walked : tuple of range
+        Numbers of the paths walked, disjoint.
+    """
+
+    targets: tuple[Queries, ...]
+    weights: tuple[int, ...]
+    bounces: int
+    seed: int
+    answers: tuple[Samples, ...] = ()
+    walked: tuple[range, ...] = ()
+
+    @classmethod
+    def of(cls, targets: Sequence[Queries], bounces: int, seed: int) -> "Bake":
+        """Begin with targets that are all equal."""
+        return cls(tuple(targets), (1,) * len(targets), bounces, seed)
+
+    @property
+    def paths(self) -> int:
+        """Paths walked from a target of weight 1."""
+        return sum(map(len, self.walked))
+
+    @property
+    def samples(self) -> Samples:
+        """All answers, one batch after the other."""
+        return self.answers[0] if len(self.answers) == 1 else join_samples(self.answers)
+
+    def walk(
+        self,
+        tracer: Tracer,
+        paths: range,
+        map: Map = map,
+        progress: Progress = lambda what, done, total: None,
+    ) -> "Bake":
+        """Walk the paths with these numbers from every target as well; see `bake` for `map` and `progress`."""
+        work = [(q, range(n * paths.start, n * paths.stop)) for q, n in zip(self.targets, self.weights)]
+        what, done, total = "more light" if self.answers else "light", 0, sum(len(q) for q in self.targets)
+        new = []
+        progress(what, 0, total)
+        for answer in map(partial(_answer, tracer, self.bounces, self.seed), work):
+            new.append(answer)
+            done += len(answer)
+            progress(what, done, total)
+        # The answers bring their queries with them: a large run holds its targets once.
+        return self.merge(replace(self, targets=tuple(a.queries for a in new), answers=tuple(new), walked=(paths,)))
+
+    def merge(self, other: "Bake") -> "Bake":
+        """Combine with a bake of the same targets and seed that walked other paths."""
+        if not self.answers:
+            return other
+        if any(max(a.start, b.start) < min(a.stop, b.stop) for a in self.walked for b in other.walked):
+            raise BadInput(f"paths {self.walked} and {other.walked} overlap; expected disjoint ranges to combine")
+        answers = tuple(combine(a, b) for a, b in zip(self.answers, other.answers))
+        return replace(other, answers=answers, walked=self.walked + other.walked)
+
+    def state(self) -> dict[str, NDArray[Any]]:
+        """All that the bake holds, as plain arrays: `from_state` takes them back."""
+        queries = join_queries(self.targets)
+        arrays = {name: getattr(queries, name) for name in QUERY_ARRAYS}
+        if self.answers:
+            arrays |= {name: getattr(self.samples, name) for name in SAMPLE_ARRAYS}
+        return arrays | {
+            "batches": np.array([len(q) for q in self.targets]),
+            "weights": np.array(self.weights),
+            "walked": np.array([(r.start, r.stop) for r in self.walked], int).reshape(-1, 2),
+            "bounces": np.array(self.bounces),
+            "seed": np.array(self.seed, np.uint64),
+        }
+
+    @classmethod
+    def from_state(cls, arrays: Mapping[str, NDArray[Any]]) -> "Bake":
+        """Take up a bake where `state` left it."""
+        queries = Queries(*(arrays[name] for name in QUERY_ARRAYS))
+        ends = np.cumsum(arrays["batches"]).tolist()
+        rows = [slice(a, b) for a, b in zip([0, *ends], ends)]
+        answers: tuple[Samples, ...] = ()
+        if len(arrays["walked"]):
+            whole = Samples(queries, *(arrays[name] for name in SAMPLE_ARRAYS))
+            answers = tuple(whole[row] for row in rows)
+        return cls(
+            tuple(queries[row] for row in rows), tuple(arrays["weights"].tolist()), int(arrays["bounces"]),
+            int(arrays["seed"]), answers, tuple(range(a, b) for a, b in arrays["walked"].tolist()),
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,9 +152,11 @@ class Baked:
     seconds : dict
         Wall time of each stage.
     queries : int
-        Number of questions asked.
+        Number of queries answered, texels among them.
     paths : int
         Paths walked from each of a field's.
+    texels, texel_paths : int
+        Queries on walls, and paths walked from each.
     holes : tuple of int
         For each field, nodes that its isosurfaces can show and no sample supports.
     """
@@ -51,6 +166,8 @@ class Baked:
     seconds: dict[str, float]
     queries: int
     paths: int
+    texels: int
+    texel_paths: int
     holes: tuple[int, ...]
 
 
@@ -88,14 +205,6 @@ def _wall_texture(rows: int, quad: Quad, answer: Samples) -> WallTexture:
     # Another row is another setting of the sweep: look there last.
     spacing = (1e3 * max(texel) * max(nu, nv), *texel)
     return WallTexture(fill_holes(spacing, answer.mean.reshape(rows, nv, nu, 3), support), support)
-
-
-def _answer(
-    scene: Scene, backend: Backend, paths: range, more: int, bounces: int, seed: int, queries: Queries
-) -> Samples:
-    if queries.target[0] >= len(scene.fields):
-        paths = range(more * paths.start, more * paths.stop)
-    return backend.solve(scene, queries, paths=paths, bounces=bounces, seed=seed)
 
 
 def holes_within_range(scene: Scene, field: int, grid: IlluminationGrid) -> int:
@@ -138,25 +247,27 @@ def _on_few_rows(scene: Scene, seed: int, rows: int = 4, count: int = 32) -> Que
     return join_queries(asked)
 
 
-def light_left_out(scene: Scene, backend: Backend, bounces: int, seed: int = 0) -> float:
+def light_left_out(scene: Scene, tracer: Tracer, bounces: int, seed: int = 0) -> float:
     """Share of all light that more than `bounces` reflections would add, from a few paths on a coarse grid.
 
     The paths with more bounces begin as those with fewer, so that the difference is light and not noise.
     """
     asked = _on_few_rows(scene, seed)
+    if not len(asked):
+        return 0.0
     mean = [
-        float(backend.solve(scene, asked, paths=range(16), bounces=b, seed=seed).mean.mean())
+        float(tracer.solve(asked, paths=range(16), bounces=b, seed=seed).mean.mean())
         for b in (bounces, 3 * bounces + 20)
     ]
     return 1.0 - mean[0] / mean[1] if mean[1] > 0 else 0.0
 
 
-def enough_bounces(scene: Scene, backend: Backend, seed: int = 0) -> tuple[int, float]:
+def enough_bounces(scene: Scene, tracer: Tracer, seed: int = 0) -> tuple[int, float]:
     """Reflections to follow, and the share of light left out: below 1 %, and at least 4 reflections."""
-    bounces, left_out = 4, light_left_out(scene, backend, 4, seed)
+    bounces, left_out = 4, light_left_out(scene, tracer, 4, seed)
     while bounces < 128 and left_out >= 0.01:
         bounces += max(1, bounces // 4)
-        left_out = light_left_out(scene, backend, bounces, seed)
+        left_out = light_left_out(scene, tracer, bounces, seed)
     return bounces, left_out
 
 
@@ -196,27 +307,20 @@ def bake(
         Told (what, done, total).
     """
     clock = [time.perf_counter()]
-    batches = [batch for batch in sampler.queries(scene, specs, seed) if len(batch)]
+    nodes = [batch for batch in sampler.queries(scene, specs, seed) if len(batch)]
     texels = wall_queries(scene, levels)
-    more = texel_paths(sum(map(len, batches)), sum(map(len, texels)))
-    batches += texels
+    asked, on_walls = (sum(len(batch) for batch in batches) for batches in (nodes, texels))
+    more = texel_paths(asked, on_walls)
+    state = Bake((*nodes, *texels), (1,) * len(nodes) + (more,) * len(texels), bounces, seed)
+    del nodes, texels
     clock.append(time.perf_counter())
-
-    total, walked = sum(len(batch) for batch in batches), 0
-    answers: list[Samples] = []
+    tracer = prepare(backend, scene)
     for numbers in paths:
-        what, done, new = "more light" if answers else "light", 0, []
-        progress(what, 0, total)
-        for answer in map(partial(_answer, scene, backend, numbers, more, bounces, seed), batches):
-            new.append(answer)
-            done += len(answer)
-            progress(what, done, total)
-        answers = [combine(old, now) for old, now in zip(answers, new)] if answers else new
-        walked += len(numbers)
+        state = state.walk(tracer, numbers, map, progress)
     clock.append(time.perf_counter())
 
-    grids = []
-    del batches, texels
+    grids, answers, walked = [], list(state.answers), state.paths
+    del state
     for number, spec in enumerate(specs):
         samples = _of_field(scene, answers, number)
         answers = [a for a in answers if (a.queries.target != number).any()]  # a large run is held once, not twice
@@ -229,8 +333,10 @@ def bake(
         grids=tuple(grids),
         walls=tuple(walls),
         seconds=dict(zip(("sampler", "backend", "interpolator"), np.diff(clock).tolist())),
-        queries=total,
+        queries=asked + on_walls,
         paths=walked,
+        texels=on_walls,
+        texel_paths=more * walked,
         holes=tuple(holes_within_range(scene, n, grid) for n, grid in enumerate(grids)),
     )
 

@@ -20,6 +20,7 @@ from illumgrid.grid import IlluminationGrid
 from illumgrid.io import store
 from illumgrid.light import Illumination
 from illumgrid.stages import Backend, Interpolator, Sampler
+from illumgrid.transport.tracer import prepare
 
 
 def load(folder: str | os.PathLike[str]) -> Illumination:
@@ -118,10 +119,11 @@ def run(
         grid, bounces = plan.grid, plan.bounces
         walked = [range(plan.paths)] if seconds is None or paths is not None else rounds(plan, begun + seconds)
     specs = [nodes_over(field.volume, grid) for field in scene.fields]
+    tracer = prepare(chosen[1], scene)
     if bounces is None:
-        bounces, left_out = enough_bounces(scene, chosen[1], seed)
+        bounces, left_out = enough_bounces(scene, tracer, seed)
     else:
-        left_out = light_left_out(scene, chosen[1], bounces, seed)
+        left_out = light_left_out(scene, tracer, bounces, seed)
     baked = bake(scene, specs, levels, *chosen, paths=walked, bounces=bounces, seed=seed, map=map, progress=progress)
     for field, holes in zip(scene.fields, baked.holes):
         if holes:

@@ -13,6 +13,7 @@ from illumgrid.field.volume import Floats, cell_gradient, index_to_world, interp
 from illumgrid.grid import IlluminationGrid
 from illumgrid.stages import Backend, on_level_sets
 from illumgrid.transport.samples import Queries, Samples, combine, join_queries
+from illumgrid.transport.tracer import prepare
 
 MOST_BOUNCES = 128
 _STEPS = 64  # of the isovalue, within which points are uniform by area
@@ -179,8 +180,8 @@ def _cells_by_step(field: Field) -> tuple[NDArray[np.int64], Floats]:
 
 def enough(scene: Scene, backend: Backend, tolerance: float, seed: int) -> int:
     """Reflections beyond which less than `tolerance` of all light is left out."""
-    bounces = 8
-    while bounces < MOST_BOUNCES and light_left_out(scene, backend, bounces, seed) > tolerance:
+    bounces, tracer = 8, prepare(backend, scene)
+    while bounces < MOST_BOUNCES and light_left_out(scene, tracer, bounces, seed) > tolerance:
         bounces *= 2
     return bounces
 

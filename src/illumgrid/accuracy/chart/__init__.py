@@ -20,6 +20,7 @@ from illumgrid.field.scene import Scene
 from illumgrid.samplers.direct import Direct, reachable
 from illumgrid.stages import Backend
 from illumgrid.transport.samples import Queries
+from illumgrid.transport.tracer import prepare
 
 TRUTH, PARTS, PICTURE, OTHER = 0.25, 0.12, 0.05, 0.05
 """Shares of the budget: for the truth, the parts of the error, the converged picture, and to begin another truth."""
@@ -143,7 +144,7 @@ def bench(
             "60"
         )
     auto = registry.backend("auto")
-    light_left_out(scene, auto, 0)  # compiles
+    light_left_out(scene, prepare(auto, scene), 0)  # compiles
     begun = time.perf_counter()
     asked = _unseen(scene, budget, seed)
     if not len(asked):

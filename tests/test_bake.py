@@ -1,0 +1,89 @@
+"""The accumulator: walks go on, combine, and come back from plain arrays."""
+
+from concurrent.futures import ThreadPoolExecutor
+from io import BytesIO
+
+import numpy as np
+import pytest
+
+from illumgrid.backends.numba_ import Numba
+from illumgrid.bake import Bake, shifted_seed, wall_queries
+from illumgrid.field.scene import Scene, level_table
+from illumgrid.grid import GridSpec
+from illumgrid.samplers.direct import Direct
+from illumgrid.transport.tracer import prepare
+from shapes import ball, refused
+
+SEED = 2**64 - 3
+
+
+@pytest.fixture(scope="module")
+def begun():
+    """Nodes of a ball over a floor, and the texels of the floor with twice the paths."""
+    scene = Scene.floor(ball(9), range=(0.4, 0.9))
+    nodes = list(Direct().queries(scene, [GridSpec.over(scene.fields[0].volume, 6)], 0))
+    texels = wall_queries(scene, level_table(scene, 2))
+    tracer = prepare(Numba(), scene)
+    return tracer, Bake((*nodes, *texels), (1,) * len(nodes) + (2,) * len(texels), 2, SEED)
+
+
+def same(one, other):
+    for a, b in zip((*one.answers, *one.targets), (*other.answers, *other.targets), strict=True):
+        for name in vars(a).keys() - {"queries"}:
+            np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
+    assert (one.walked, one.weights, one.bounces, one.seed) == (other.walked, other.weights, other.bounces, other.seed)
+
+
+def test_a_walk_is_what_the_tracer_answers_and_texels_have_their_own_number_of_paths(begun):
+    tracer, bake = begun
+    found = bake.walk(tracer, range(3, 9))
+    for targets, weight, answer in zip(bake.targets, bake.weights, found.answers, strict=True):
+        asked = tracer.solve(targets, paths=range(3 * weight, 9 * weight), bounces=2, seed=SEED)
+        np.testing.assert_array_equal(answer.mean, asked.mean)
+        np.testing.assert_array_equal(answer.paths, asked.paths)
+    assert found.paths == 6 and found.walked == (range(3, 9),)
+    assert len(found.samples) == sum(map(len, bake.targets))
+
+
+def test_walks_one_after_the_other_and_merged_are_one_long_walk(begun):
+    tracer, bake = begun
+    whole = bake.walk(tracer, range(16))
+    went_on = bake.walk(tracer, range(4)).walk(tracer, range(4, 16))
+    merged = bake.walk(tracer, range(4)).merge(bake.walk(tracer, range(4, 16)))
+    same(went_on, merged)
+    assert went_on.paths == whole.paths == 16
+    for a, b in zip(went_on.answers, whole.answers):
+        np.testing.assert_allclose(a.mean, b.mean, rtol=1e-5, atol=1e-6)
+        np.testing.assert_array_equal(a.paths, b.paths)
+
+
+def test_paths_are_never_counted_twice(begun):
+    tracer, bake = begun
+    found = bake.walk(tracer, range(4))
+    refused(lambda: found.walk(tracer, range(3, 6)), "overlap", "disjoint")
+
+
+def test_a_state_of_plain_arrays_goes_on_bit_by_bit(begun):
+    tracer, bake = begun
+    for before in (bake, bake.walk(tracer, range(4))):
+        file = BytesIO()
+        np.savez(file, **before.state())
+        file.seek(0)
+        with np.load(file, allow_pickle=False) as arrays:
+            after = Bake.from_state(arrays)
+        same(after, before)
+        same(after.walk(tracer, range(4, 8)), before.walk(tracer, range(4, 8)))
+
+
+def test_any_map_gives_the_same_and_tells_how_far_it_is(begun):
+    tracer, bake = begun
+    reported = []
+    with ThreadPoolExecutor(2) as pool:
+        one = bake.walk(tracer, range(4), pool.map, lambda *what: reported.append(what))
+    same(one, bake.walk(tracer, range(4)))
+    total = sum(map(len, bake.targets))
+    assert reported[0] == ("light", 0, total) and reported[-1] == ("light", total, total)
+
+
+def test_seeds_beside_a_seed_stay_within_64_bits():
+    assert shifted_seed(2**64 - 1, 1) == 0 and shifted_seed(5, 2**63) == 2**63 + 5
