@@ -40,14 +40,14 @@ def measure(scene, bounces):
     works = {}
     for name, backend in contenders().items():
         for threads in (1, 2) if name in PATHS else ():
-            stage = replace(backend, threads=threads)
+            tracer = replace(backend, threads=threads).prepare(scene)
 
-            def work(stage=stage, count=PATHS[name]):
-                stage.solve(scene, queries, paths=range(count), bounces=bounces, seed=0)
+            def work(tracer=tracer, count=PATHS[name]):
+                tracer.solve(queries, paths=range(count), bounces=bounces, seed=0)
 
             works[name, threads] = work
             work()
-    build = min(timed(lambda: meshes._build(scene.fields[0].volume, LEVEL, "above")) for _ in range(3))
+    build = min(timed(lambda: meshes.level_mesh(scene.fields[0], LEVEL)) for _ in range(3))
     seconds = np.array([[timed(work) for work in works.values()] for _ in range(ROUNDS)])
     each = dict(zip(works, seconds.T))
     rate = {key: PATHS[key[0]] * len(queries) / spent for key, spent in each.items()}

@@ -170,9 +170,7 @@ def measure(scene, mesh, level, on, origin, direction):
     """All figures of one scene."""
     volume = scene.fields[0].volume
     builds = {
-        "bricks": lambda: marchable(
-            Scene.sky(Volume(volume.values), range=(level, level + 0.1))
-        ),  # a volume keeps them
+        "bricks": partial(marchable, scene),
         "isosurface": partial(isosurface, volume, level),
         "bvh": partial(bvh.build, mesh.vertices, mesh.faces),
     }

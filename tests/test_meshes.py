@@ -2,7 +2,10 @@
 
 import gc
 import math
+import pickle
+import time
 import weakref
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -11,13 +14,14 @@ import pytest
 import naive
 import naive_mesh
 from illumgrid import registry
-from illumgrid.backends import embree, meshes
+from illumgrid.backends import bvh, embree, meshes
 from illumgrid.backends.embree import Casting, Embree
-from illumgrid.backends.meshes import LevelMesh, level_mesh, meshed, row_groups
+from illumgrid.backends.meshes import LevelMesh, Meshes, level_mesh, meshed, row_groups
 from illumgrid.backends.numba_ import Numba
-from illumgrid.backends.reference import answer
+from illumgrid.backends.reference import Reference, answer
 from illumgrid.errors import BadInput
-from illumgrid.field.levelset import isosurface
+from illumgrid.field import levelset
+from illumgrid.field.levelset import isosurface, marchable
 from illumgrid.field.scene import Scene
 from illumgrid.field.volume import Volume
 from illumgrid.rng import stream
@@ -49,7 +53,7 @@ class Brute:
                 found = [own[f].first(a, b) or (math.inf, -1) for a, b in zip(x, d)]
                 return np.array([t for t, _ in found]), np.array([face for _, face in found], np.int64)
 
-            surfaces = Casting(meshed(scene, row), cast)
+            surfaces = Casting(meshed(marchable(scene), Meshes(scene, bvh.build).of(row)), cast)
             target = queries.target[members].astype(np.int64)
             light, spread, good = answer(
                 surfaces, key[members], level[members], target, point[members], normal[members], paths, bounces
@@ -189,20 +193,44 @@ def test_an_answer_does_not_depend_on_the_batch():
     assert len(list(row_groups(scene, queries.level))) <= 14
 
 
-def test_meshes_are_built_once_kept_while_there_is_room_and_go_with_their_volume(monkeypatch):
-    scene = small("below, mirrored")
-    field = scene.fields[0]
-    one = level_mesh(field, 0.25)
-    assert level_mesh(field, 0.25) is one
+def test_meshes_are_built_once_kept_while_there_is_room_and_go_with_their_tracer(monkeypatch):
+    kept = MESH.prepare(small("below, mirrored")).meshes
+    (one,) = kept.of(np.array([0.25]))
+    assert kept.of(np.array([0.25])) == [one]
     assert isinstance(one, LevelMesh) and one.size > 0
     monkeypatch.setattr(meshes, "ROOM", 2 * one.size)
-    others = [level_mesh(field, level) for level in (0.1, 0.2, 0.3)]
-    assert level_mesh(field, 0.3) is others[-1]
-    assert level_mesh(field, 0.25) is not one
-    volume = weakref.ref(field.volume)
-    del scene, field, others, one
+    others = [kept.of(np.array([level]))[0] for level in (0.1, 0.2, 0.3)]
+    assert kept.of(np.array([0.3])) == others[-1:]
+    assert kept.of(np.array([0.25])) != [one]
+    gone = weakref.ref(one)
+    del kept, others, one
     gc.collect()
-    assert volume() is None
+    assert gone() is None
+
+
+def test_threads_that_ask_for_one_mesh_at_once_get_the_same(monkeypatch):
+    built, build = [], meshes.level_mesh
+    monkeypatch.setattr(meshes, "level_mesh", lambda *key: (time.sleep(0.01), built.append(key), build(*key))[2])
+    kept = MESH.prepare(small("below, mirrored")).meshes
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(lambda level: kept.of(np.array([level]))[0], [0.25, 0.1] * 8))
+    assert len(built) == len({id(mesh) for mesh in found}) == 2
+
+
+@pytest.mark.parametrize("stage", [Numba(), MESH, Reference(), pytest.param("embree", marks=needs_embree)])
+def test_a_tracer_is_set_up_once_and_again_in_another_process(stage, monkeypatch):
+    stage = Embree() if stage == "embree" else stage
+    scene = small("two")
+    queries, request = on_sets(scene, 2, 20), {"paths": range(4), "bounces": 2, "seed": 1}
+    whole = stage.solve(scene, queries, **request)
+    tracer = stage.prepare(scene)
+    copy = pickle.loads(pickle.dumps(tracer))
+    laid = []
+    monkeypatch.setattr(levelset, "lay_bricks", laid.append)
+    for again in (tracer.solve(queries, **request), copy.solve(queries[::-1], **request)[::-1]):
+        np.testing.assert_array_equal(again.mean, whole.mean)
+        np.testing.assert_array_equal(again.paths, whole.paths)
+    assert not laid
 
 
 def test_too_many_rows_are_refused_in_one_sentence():

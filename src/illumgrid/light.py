@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from illumgrid import tone
+from illumgrid.field.levelset import Marchable, marchable
 from illumgrid.field.scene import Levels, Scene
 from illumgrid.grid import IlluminationGrid, WallTexture
 
@@ -50,6 +51,11 @@ class Illumination:
             for field, grid in zip(self.scene.fields, self.grids)
         ]
         return tone.automatic_exposure(np.concatenate(shown))
+
+    @cached_property
+    def marchable(self) -> Marchable:
+        """The scene laid out for rays, for all pictures."""
+        return marchable(self.scene)
 
     def color(self, points: ArrayLike, field: str | None = None, exposure: float | None = None) -> NDArray[np.uint8]:
         """Display colour of the isosurface at world points.

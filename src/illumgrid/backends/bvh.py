@@ -246,6 +246,16 @@ def aligned(elements: int, dtype: Any) -> NDArray[Any]:
     return raw[start : start + 4 * elements].view(dtype)
 
 
+def unit_cube(corners: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
+    """What moves and scales the corners (m, 3, 3) of triangles into [-1, 1]³: centre (3,) and a power of two."""
+    if len(corners) == 0:
+        return np.zeros(3), 1.0
+    low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
+    centre = low + 0.5 * (high - low)
+    extent = max(float((high - centre).max()), 1e-300)
+    return centre, float(2.0 ** -np.ceil(np.log2(extent)))
+
+
 def build(vertices: ArrayLike, faces: ArrayLike) -> Tree:
     """Build the tree of a mesh.
 
@@ -260,14 +270,11 @@ def build(vertices: ArrayLike, faces: ArrayLike) -> Tree:
     Tree
     """
     corners = np.asarray(vertices, np.float64).reshape(-1, 3)[np.asarray(faces, np.int64).reshape(-1, 3)]
+    centre, scale = unit_cube(corners)
     if len(corners) == 0:
         memory = aligned(NODE, np.float32)
         memory[:LINKS] = np.repeat([np.inf, -np.inf] * 3, WIDE)
-        return Tree(memory, np.zeros(3), 1.0, 1)
-    low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
-    centre = low + 0.5 * (high - low)
-    extent = max(float((high - centre).max()), 1e-300)
-    scale = float(2.0 ** -np.ceil(np.log2(extent)))
+        return Tree(memory, centre, scale, 1)
     triangles = ((corners - centre) * scale).astype(np.float32)
     bounds = np.concatenate([triangles.min(axis=1), triangles.max(axis=1)], axis=1)
     order = np.arange(len(triangles))
@@ -281,7 +288,7 @@ def build(vertices: ArrayLike, faces: ArrayLike) -> Tree:
 
 def stack_for(*trees: Tree) -> NDArray[np.int32]:
     """Room for the traversal of any of these trees: one for each thread, however many rays."""
-    return aligned((max(tree.depth for tree in trees) + 1) * FRAME, np.int32)
+    return aligned((max((tree.depth for tree in trees), default=0) + 1) * FRAME, np.int32)
 
 
 # Everything happens within |x| <= 2, where coordinates are wrong by 2^-24 and what is made of them by less than

@@ -5,16 +5,17 @@ same paths but where a ray grazes an edge.
 """
 
 import importlib.util
-import weakref
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from illumgrid.backends.meshes import LevelMesh, level_mesh, meshed, row_groups
-from illumgrid.backends.numba_ import cores, share
+from illumgrid.backends.bvh import unit_cube
+from illumgrid.backends.meshes import LevelMesh, Meshes, meshed, row_groups
+from illumgrid.backends.numba_ import pool, share
 from illumgrid.backends.reference import (
     BURIED,
     CAP,
@@ -29,11 +30,13 @@ from illumgrid.backends.reference import (
     gradient_normal,
 )
 from illumgrid.errors import BadInput
+from illumgrid.field.levelset import Marchable, marchable
 from illumgrid.field.scene import Scene
 from illumgrid.field.volume import Floats
 from illumgrid.rng import stream
 from illumgrid.stages import Backend, hookimpl
 from illumgrid.transport.samples import Queries, Samples, in_frame, in_turn
+from illumgrid.transport.tracer import solve_once
 
 Cast = Callable[[int, Floats, Floats], tuple[Floats, Ints]]
 """First face of field f's mesh along frame rays (n, 3): distance and number in that mesh, each (n,); inf, -1: none."""
@@ -132,29 +135,25 @@ def near_enough(x: Floats, d: Floats) -> Floats:
     return np.where(np.abs(x).max(axis=1, initial=0.0) <= 2.0, 0.0, np.where(high < 0, np.inf, start))
 
 
-_scenes: "weakref.WeakKeyDictionary[LevelMesh, Any]" = weakref.WeakKeyDictionary()
-
-
-def embree_scene(mesh: LevelMesh) -> Any:
-    """Embree's scene of a mesh, in the space of its tree; kept as long as the mesh is."""
+def grow(vertices: Floats, faces: Ints) -> Any:
+    """Embree's scene of a mesh, in the space of `LevelMesh`; None without faces, which Embree does not take."""
     from embreex.mesh_construction import TriangleMesh
     from embreex.rtcore_scene import EmbreeScene
 
-    if mesh not in _scenes:
-        scene = EmbreeScene(robust=True)  # no ray gets between two faces
-        vertices = ((mesh.vertices - mesh.tree.centre) * mesh.tree.scale).astype(np.float32)
-        TriangleMesh(scene, vertices, mesh.faces)
-        scene.run(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32))  # builds the tree
-        _scenes[mesh] = scene
-    return _scenes[mesh]
+    if not len(faces):
+        return None
+    centre, scale = unit_cube(vertices[faces])
+    scene = EmbreeScene(robust=True)  # no ray gets between two faces
+    TriangleMesh(scene, ((vertices - centre) * scale).astype(np.float32), faces.astype(np.int32))
+    scene.run(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32))  # builds the tree
+    return scene
 
 
-def by_embree(scene: Any, meshes: list[LevelMesh]) -> Cast:
+def by_embree(scene: Any, meshes: Sequence[LevelMesh]) -> Cast:
     """How embreex casts rays."""
-    built = [embree_scene(mesh) if len(mesh.faces) else None for mesh in meshes]
 
     def cast(f: int, x: Floats, d: Floats) -> tuple[Floats, Ints]:
-        tree = built[f]
+        tree = meshes[f].tree
         if tree is None or not len(x):
             return np.full(len(x), np.inf), np.full(len(x), -1)
         x, d = (x - scene.centre[f]) * scene.scale[f], d * scene.scale[f]
@@ -195,14 +194,34 @@ class Embree:
         """None, or what would make it so."""
         return None if importlib.util.find_spec("embreex") else "pip install embreex"
 
+    def prepare(self, scene: Scene) -> "EmbreeTracer":
+        """Lay the fields out; meshes are built when they are asked for."""
+        return EmbreeTracer(self, scene, marchable(scene), Meshes(scene, grow), pool(self.threads))
+
+    solve = solve_once
+
+
+@dataclass(frozen=True, eq=False)
+class EmbreeTracer:
+    """A scene set up for `Embree`."""
+
+    backend: Embree
+    scene: Scene
+    fields: Marchable
+    meshes: Meshes
+    threads: ThreadPoolExecutor | None
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return self.backend.prepare, (self.scene,)
+
     @in_turn
-    def solve(self, scene: Scene, queries: Queries, *, paths: range, bounces: int, seed: int) -> Samples:
+    def solve(self, queries: Queries, *, paths: range, bounces: int, seed: int) -> Samples:
         """Trace paths from every query: see `illumgrid.stages.Backend`."""
         n = len(queries)
         mean, m2 = np.zeros((n, 3), np.float32), np.zeros((n, 3), np.float32)
         count = np.zeros(n, np.int32)
         if n and len(paths):
-            point, normal, level = in_frame(scene, queries)
+            point, normal, level = in_frame(self.scene, queries)
             with np.errstate(over="ignore"):
                 key = stream(np.uint64(seed), queries.id)
 
@@ -213,14 +232,14 @@ class Embree:
                 )
                 mean[rows], m2[rows], count[rows] = light, spread, np.where(good, len(paths), 0)
 
-            share(chunk, self._pieces(scene, queries.level), self.threads or cores())
+            share(self.threads, chunk, self._pieces(queries.level))
         return Samples(queries, mean, m2, count)
 
-    def _pieces(self, scene: Scene, level: Floats) -> Iterator[tuple[Casting, NDArray[np.int64]]]:
+    def _pieces(self, level: Floats) -> Iterator[tuple[Casting, NDArray[np.int64]]]:
         """What the rays meet, and queries for which it does."""
-        for row, members in row_groups(scene, level):
-            layout = meshed(scene, row)
-            meshes = [level_mesh(field, c) for field, c in zip(scene.fields, row.tolist())]
+        for row, members in row_groups(self.scene, level):
+            meshes = self.meshes.of(row)
+            layout = meshed(self.fields, meshes)
             surfaces = Casting(layout, by_embree(layout, meshes))
             for i in range(0, len(members), 1024):
                 yield surfaces, members[i : i + 1024]

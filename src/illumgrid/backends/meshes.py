@@ -1,12 +1,12 @@
 """Level sets as closed meshes that rays meet: grouped by level, built once, kept while there is room.
 
-A mesh lies in the axes of its volume, from voxel 0, in world units: what is built does not depend on the scene.
+A mesh lies in the axes of its volume, from voxel 0, in world units.
 """
 
-import weakref
 from collections import OrderedDict, namedtuple
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from illumgrid.backends import bvh
 from illumgrid.errors import BadInput
-from illumgrid.field.levelset import Marchable, extract, marchable
+from illumgrid.field.levelset import Marchable, extract
 from illumgrid.field.scene import Field, Scene
-from illumgrid.field.volume import Floats, Side, Volume
+from illumgrid.field.volume import Floats
 
 SAME_LEVEL = 1e-6
 """Levels that this share of a field's range rounds to the same number share a mesh."""
@@ -25,7 +25,10 @@ MOST_ROWS = 256
 """Rows of levels that one request may have: at 128³ voxels each costs about half a second to extract and to build."""
 
 ROOM = 1 << 28
-"""Bytes of meshes that are kept for each volume; the one used longest ago goes first."""
+"""Bytes of meshes that a tracer keeps; the one used longest ago goes first."""
+
+TREE = 160
+"""Bytes of a tree for each face of its mesh, about."""
 
 OFF = 2.0**-19
 """How far rays start off a face, as a share of the half extent of its mesh: what rounding to single precision may move
@@ -34,7 +37,7 @@ a triangle, an origin and a hit, four times over."""
 
 @dataclass(frozen=True, eq=False)
 class LevelMesh:
-    """The solid of one field at one level: a closed mesh, and the tree over it.
+    """The solid of one field at one level: a closed mesh, and what casts rays at it.
 
     Parameters
     ----------
@@ -45,46 +48,71 @@ class LevelMesh:
         Unit normals of the faces as the tree has them, in single precision; 0 where a face has no area.
     cap : (m,) bool
         Faces on the border of the volume.
-    tree : Tree
+    centre : (3,) float64
+    scale : float
+        What moves and scales the mesh into [-1, 1]³, the space of the tree: see `bvh.unit_cube`.
+    tree : object
+        What a backend made of the mesh in that space, such as a `bvh.Tree`.
     """
 
     vertices: Floats
     faces: NDArray[np.int32]
     facing: Floats
     cap: NDArray[np.bool_]
-    tree: bvh.Tree
+    centre: Floats
+    scale: float
+    tree: Any
 
     @property
     def size(self) -> int:
-        """Bytes."""
-        return int(sum(a.nbytes for a in (self.vertices, self.faces, self.facing, self.cap, self.tree.memory)))
+        """Bytes; a tree takes about `TREE` a face."""
+        return int(sum(a.nbytes for a in (self.vertices, self.faces, self.facing, self.cap)) + TREE * len(self.faces))
 
 
-def _build(volume: Volume, level: float, inside: Side) -> LevelMesh:
-    """Extract a level set with caps, and build its tree."""
-    index, faces = extract(volume, level, inside, capped=True)
+def level_mesh(field: Field, level: float, grow: Callable[[Floats, NDArray[np.int64]], Any] = bvh.build) -> LevelMesh:
+    """Mesh of the solid of a field, with caps; `grow` makes a tree of vertices (k, 3) and faces (m, 3)."""
+    volume = field.volume
+    index, faces = extract(volume, level, field.inside, capped=True)
     corners, last = index[faces], np.array(volume.shape) - 1
     cap = ((corners == 0).all(axis=1) | (corners == last).all(axis=1)).any(axis=1)
     vertices = index * volume.spacing
-    tree = bvh.build(vertices, faces)
-    triangles = ((vertices - tree.centre) * tree.scale).astype(np.float32)[faces].astype(float)
+    centre, scale = bvh.unit_cube(vertices[faces])
+    triangles = ((vertices - centre) * scale).astype(np.float32)[faces].astype(float)
     across = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     area = np.linalg.norm(across, axis=1, keepdims=True)
-    return LevelMesh(vertices, faces.astype(np.int32), across / np.where(area > 0, area, 1.0), cap, tree)
+    facing = across / np.where(area > 0, area, 1.0)
+    return LevelMesh(vertices, faces.astype(np.int32), facing, cap, centre, scale, grow(vertices, faces))
 
 
-_kept: "weakref.WeakKeyDictionary[Volume, OrderedDict[tuple[Side, float], LevelMesh]]" = weakref.WeakKeyDictionary()
+@dataclass(frozen=True, eq=False)
+class Meshes:
+    """Level sets of a scene as meshes: each is built when it is first asked for, and kept while there is room.
 
+    Any thread may ask: one builds, the others wait.
 
-def level_mesh(field: Field, level: float) -> LevelMesh:
-    """Mesh of the solid of a field; from the last ones built for its volume, if it is among them."""
-    kept = _kept.setdefault(field.volume, OrderedDict())
-    key = field.inside, level
-    mesh = kept.pop(key, None) or _build(field.volume, level, field.inside)
-    kept[key] = mesh
-    while len(kept) > 1 and sum(m.size for m in kept.values()) > ROOM:
-        kept.popitem(last=False)
-    return mesh
+    Parameters
+    ----------
+    scene : Scene
+    grow : callable
+        See `level_mesh`.
+    """
+
+    scene: Scene
+    grow: Callable[[Floats, NDArray[np.int64]], Any]
+    _kept: "OrderedDict[tuple[int, float], LevelMesh]" = field(default_factory=OrderedDict)
+    _lock: Any = field(default_factory=Lock)
+
+    def of(self, row: Floats) -> list[LevelMesh]:
+        """Those of every field under a row of levels (F,)."""
+        with self._lock:
+            found = []
+            for key in enumerate(row.tolist()):
+                mesh = self._kept.pop(key, None) or level_mesh(self.scene.fields[key[0]], key[1], self.grow)
+                self._kept[key] = mesh
+                found.append(mesh)
+            while len(self._kept) > len(row) and sum(m.size for m in self._kept.values()) > ROOM:
+                self._kept.popitem(last=False)
+            return found
 
 
 def row_groups(scene: Scene, level: Floats) -> Iterator[tuple[Floats, NDArray[np.int64]]]:
@@ -117,37 +145,35 @@ Meshed = namedtuple(  # type: ignore[misc]
     "Meshed",
     (
         *Marchable._fields,
-        "memory",  # (...) float32: the trees of all fields, one after the other
-        "tree_start",  # (F,) int64: where each begins
-        "centre",  # (F, 3) frame position that is the origin of the tree's space
+        "centre",  # (F, 3) frame position that is the origin of the space of the field's mesh
         "scale",  # (F,) into that space
         "facing",  # (m, 3) unit normals of the faces of all fields, in the frame
         "cap",  # (m,) bool
         "face_start",  # (F,) int64: number of the first face of each
         "off",  # (F,) how far rays start off a face
+        "memory",  # (...) float32: the trees of all fields, one after the other, if these are `bvh.Tree`
+        "tree_start",  # (F,) int64: where each begins
         "stack",  # (...) int32: room for the traversal, one for each thread
     ),
 )
 """A `Marchable` with the meshes of one row of levels: what compiled kernels cast rays at."""
 
 
-def meshed(scene: Scene, row: Floats) -> Any:
-    """Lay out a scene under one row of levels (F,) as a `Meshed`; one field costs no copy."""
-    fields = marchable(scene)
-    meshes = [level_mesh(field, level) for field, level in zip(scene.fields, row.tolist())]
-    trees = [mesh.tree for mesh in meshes]
+def meshed(fields: Marchable, meshes: Sequence[LevelMesh]) -> Any:
+    """Lay out a scene with the meshes of one row of levels, one a field, as a `Meshed`; one field costs no copy."""
+    trees = [mesh.tree for mesh in meshes if isinstance(mesh.tree, bvh.Tree)]
     memory = [tree.memory for tree in trees]
-    scale = np.array([tree.scale for tree in trees])
+    scale = np.array([mesh.scale for mesh in meshes])
     layout: Any = Meshed
     return layout(
         *fields,
-        memory=memory[0] if len(trees) == 1 else np.concatenate(memory),
-        tree_start=np.cumsum([0, *(len(m) for m in memory)], dtype=np.int64)[:-1],
-        centre=np.array([tree.centre for tree in trees]) + fields.origin,
+        centre=np.array([mesh.centre for mesh in meshes]) + fields.origin,
         scale=scale,
         facing=np.concatenate([mesh.facing for mesh in meshes]),
         cap=np.concatenate([mesh.cap for mesh in meshes]),
         face_start=np.cumsum([0, *(len(mesh.faces) for mesh in meshes)], dtype=np.int64)[:-1],
         off=OFF / scale,
+        memory=memory[0] if len(trees) == 1 else np.concatenate([np.zeros(0, np.float32), *memory]),
+        tree_start=np.cumsum([0, *(len(m) for m in memory)], dtype=np.int64)[:-1],
         stack=bvh.stack_for(*trees),
     )

@@ -4,16 +4,22 @@ import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal
+from itertools import chain
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from illumgrid.errors import BadInput
-from illumgrid.field.levelset import marchable
+from illumgrid.field.levelset import Marchable, marchable
 from illumgrid.field.scene import Scene
 from illumgrid.stages import Backend, hookimpl
 from illumgrid.transport.samples import Queries, Samples, in_frame, in_turn
+from illumgrid.transport.tracer import solve_once
+
+if TYPE_CHECKING:
+    from illumgrid.backends.meshes import Meshes
 
 Rows = slice | NDArray[np.int64]
 
@@ -49,8 +55,34 @@ class Numba:
         if self.surface not in ("auto", "levelset", "mesh"):
             raise BadInput(f"the surface is {self.surface!r}; expected 'auto', 'levelset' or 'mesh'")
 
+    def prepare(self, scene: Scene) -> "NumbaTracer":
+        """Lay the fields out; meshes are built when they are asked for."""
+        meshes = None
+        if self.surface == "mesh":
+            from illumgrid.backends import bvh
+            from illumgrid.backends.meshes import Meshes
+
+            meshes = Meshes(scene, bvh.build)
+        return NumbaTracer(self, scene, marchable(scene), meshes, pool(self.threads))
+
+    solve = solve_once
+
+
+@dataclass(frozen=True, eq=False)
+class NumbaTracer:
+    """A scene set up for `Numba`: any number of threads may ask it. A copy in another process is set up there."""
+
+    backend: Numba
+    scene: Scene
+    fields: Marchable
+    meshes: "Meshes | None"
+    threads: ThreadPoolExecutor | None
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return self.backend.prepare, (self.scene,)
+
     @in_turn
-    def solve(self, scene: Scene, queries: Queries, *, paths: range, bounces: int, seed: int) -> Samples:
+    def solve(self, queries: Queries, *, paths: range, bounces: int, seed: int) -> Samples:
         """Trace paths from every query: see `illumgrid.stages.Backend`."""
         n = len(queries)
         mean, m2 = np.zeros((n, 3), np.float32), np.zeros((n, 3), np.float32)
@@ -60,7 +92,7 @@ class Numba:
             return answer
         from illumgrid.backends.kernels import solve_queries
 
-        point, normal, level = in_frame(scene, queries)
+        point, normal, level = in_frame(self.scene, queries)
 
         def chunk(surfaces: Any, rows: Rows) -> None:
             if "stack" in surfaces._fields:  # each piece of work has a stack of its own
@@ -75,50 +107,64 @@ class Numba:
                 )  # fmt: skip
             mean[rows], m2[rows], count[rows] = light, spread, good
 
-        threads = self.threads or cores()
         # Ctrl-C waits for the chunks at work: at most a million paths each.
+        threads = self.backend.threads or cores()
         size = max(1, min(1024, max(16, n // (8 * threads) + 1), (1 << 20) // len(paths)))
-        pieces = (
+        pieces: Iterator[tuple[Any, Rows]] = (
             (surfaces, members[i : i + size])
-            for surfaces, members in self._surfaces(scene, queries.level)
+            for surfaces, members in self._surfaces(queries.level)
             for i in range(0, len(members), size)
         )
-        share(chunk, pieces, threads)
+        first = next(pieces)
+        if compiled(solve_queries, first[0]):
+            pieces = chain([first], pieces)
+        else:
+            chunk(*first)  # in the caller's thread: Ctrl-C ends a compilation only there
+        share(self.threads, chunk, pieces)
         return answer
 
-    def _surfaces(self, scene: Scene, level: NDArray[np.float64]) -> Iterator[tuple[Any, NDArray[np.int64]]]:
+    def _surfaces(self, level: NDArray[np.float64]) -> Iterator[tuple[Any, NDArray[np.int64]]]:
         """What the rays meet, and the queries for which it does."""
-        if self.surface != "mesh":
-            yield marchable(scene), np.arange(len(level))
+        if self.meshes is None:
+            yield self.fields, np.arange(len(level))
             return
         from illumgrid.backends.meshes import meshed, row_groups
 
-        for row, members in row_groups(scene, level):
-            yield meshed(scene, row), members
+        for row, members in row_groups(self.scene, level):
+            yield meshed(self.fields, self.meshes.of(row)), members
 
 
-def share(work: Callable[..., None], pieces: Iterator[tuple[Any, ...]], threads: int) -> None:
-    """Do the work on all pieces, the first one in the caller's thread: there it compiles, and Ctrl-C is heard."""
-    first = next(pieces)
-    work(*first)
-    if threads == 1:
+def compiled(kernel: Any, surfaces: Any) -> bool:
+    """Whether a kernel is compiled for surfaces of this type; as plain Python it always is."""
+    known = getattr(kernel, "signatures", None)
+    return known is None or any(signature[0] == numba.typeof(surfaces) for signature in known)
+
+
+def pool(threads: int) -> ThreadPoolExecutor | None:
+    """So many threads, 0 for one per processor; None for a single one, whose work the caller does."""
+    return None if (threads or cores()) == 1 else ThreadPoolExecutor(threads or cores())
+
+
+def share(threads: ThreadPoolExecutor | None, work: Callable[..., None], pieces: Iterator[tuple[Any, ...]]) -> None:
+    """Do the work on all pieces. They are made while others are at work, but not many before their turn."""
+    if threads is None:
         for piece in pieces:
             work(*piece)
         return
-    pool = ThreadPoolExecutor(threads)
+    waiting: set[Future[None]] = set()
     try:
-        # Pieces are made while others are at work, but not many before their turn.
-        waiting: set[Future[None]] = set()
         for piece in pieces:
-            waiting.add(pool.submit(work, *piece))
-            if len(waiting) >= 4 * threads:
+            waiting.add(threads.submit(work, *piece))
+            if len(waiting) >= 4 * cores():
                 done, waiting = wait(waiting, return_when=FIRST_COMPLETED)
                 for future in done:
                     future.result()
         for future in waiting:
             future.result()
-    finally:
-        pool.shutdown(cancel_futures=True)  # on Ctrl-C the chunks that wait are dropped
+    finally:  # on Ctrl-C the chunks that wait are dropped
+        for future in waiting:
+            future.cancel()
+        wait(waiting)
 
 
 @hookimpl

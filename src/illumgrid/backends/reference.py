@@ -17,6 +17,7 @@ from illumgrid.field.volume import ON_A_VOXEL, Floats
 from illumgrid.rng import draw, draw_pair, net_size, sharing, stream
 from illumgrid.stages import Backend, hookimpl
 from illumgrid.transport.samples import Queries, Samples, in_frame, in_turn
+from illumgrid.transport.tracer import solve_once
 
 Bools = NDArray[np.bool_]
 Ints = NDArray[np.int64]
@@ -461,14 +462,28 @@ class Reference:
     name: ClassVar[str] = "reference"
     geometry: ClassVar[Literal["mesh", "levelset", "both"]] = "levelset"
 
+    def prepare(self, scene: Scene) -> "ReferenceTracer":
+        """Lay the fields out."""
+        return ReferenceTracer(scene, Marching(marchable(scene)))
+
+    solve = solve_once
+
+
+@dataclass(frozen=True, eq=False)
+class ReferenceTracer:
+    """A scene set up for `Reference`."""
+
+    scene: Scene
+    surfaces: Marching
+
     @in_turn
-    def solve(self, scene: Scene, queries: Queries, *, paths: range, bounces: int, seed: int) -> Samples:
+    def solve(self, queries: Queries, *, paths: range, bounces: int, seed: int) -> Samples:
         """Trace paths from every query: see `illumgrid.stages.Backend`."""
-        point, normal, level = in_frame(scene, queries)
+        point, normal, level = in_frame(self.scene, queries)
         with np.errstate(over="ignore"):
             key = stream(np.uint64(seed), queries.id)
-        surfaces = Marching(marchable(scene))
-        mean, m2, good = answer(surfaces, key, level, queries.target.astype(np.int64), point, normal, paths, bounces)
+        target = queries.target.astype(np.int64)
+        mean, m2, good = answer(self.surfaces, key, level, target, point, normal, paths, bounces)
         count = np.where(good, len(paths), 0).astype(np.int32)
         return Samples(queries, mean.astype(np.float32), m2.astype(np.float32), count)
 

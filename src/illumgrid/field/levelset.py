@@ -1,13 +1,12 @@
 """A level set, as a mesh and as something to march through."""
 
-import weakref
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from illumgrid.errors import BadInput
-from illumgrid.field.bricks import Bricks, lay_bricks
+from illumgrid.field.bricks import lay_bricks
 from illumgrid.field.scene import Scene
 from illumgrid.field.volume import UPWARD, Floats, Side, Volume, index_to_world
 
@@ -116,24 +115,16 @@ class Marchable(NamedTuple):
     lamplight: Floats  # (3,) radiance of all lamps, were their power spread over a box around the scene
 
 
-_turned: "weakref.WeakKeyDictionary[Volume, dict[Side, tuple[NDArray[np.float32], Bricks]]]"
-_turned = weakref.WeakKeyDictionary()
-
-
-def turned(volume: Volume, inside: Side) -> tuple[NDArray[np.float32], Bricks]:
-    """Values with the solid upwards, and their bricks; built once for each volume and side."""
-    known = _turned.setdefault(volume, {})
-    if inside not in known:
-        values = volume.values if UPWARD[inside] > 0 else -volume.values
-        known[inside] = values, lay_bricks(values)
-    return known[inside]
+def turned(volume: Volume, inside: Side) -> NDArray[np.float32]:
+    """Values with the solid upwards; no copy where it is so already."""
+    return volume.values if UPWARD[inside] > 0 else -volume.values
 
 
 def marchable(scene: Scene) -> Marchable:
-    """Lay out a scene for marching; one field costs no copy."""
+    """Lay out a scene for marching, which takes a while: keep it. One field costs no copy of its values."""
     parts = [turned(f.volume, f.inside) for f in scene.fields]
-    values = [p[0].reshape(-1) for p in parts]
-    bricks = [p[1] for p in parts]
+    values = [p.reshape(-1) for p in parts]
+    bricks = [lay_bricks(p) for p in parts]
     records = [b.records.reshape(-1) for b in bricks]
     materials = [f.material for f in scene.fields] + [q.material for q in scene.quads]
     together = values[0].view() if len(parts) == 1 else np.concatenate(values)
@@ -141,7 +132,7 @@ def marchable(scene: Scene) -> Marchable:
     return Marchable(
         values=together,
         start=np.cumsum([0, *(len(v) for v in values)], dtype=np.int64)[:-1],
-        shape=np.array([p[0].shape for p in parts], dtype=np.int64),
+        shape=np.array([p.shape for p in parts], dtype=np.int64),
         origin=scene.to_frame([f.volume.origin for f in scene.fields]),
         spacing=np.array([f.volume.spacing for f in scene.fields]),
         steps=np.array([b.steps for b in bricks]),

@@ -81,7 +81,7 @@ def outline_of(scene: Scene, row: Floats) -> Floats:
     """World points (m, 3) whose hull is that of walls, and of the solids under a row of levels (volumes if none)."""
     found = []
     for field, level in zip(scene.fields, row * upward(scene)):
-        values = turned(field.volume, field.inside)[0]
+        values = turned(field.volume, field.inside)
         for axis in range(3):
             ends = _column_ends(np.moveaxis(values, axis, 2), level)
             found.append(index_to_world(field.volume, np.insert(ends[:, :2], axis, ends[:, 2], axis=1)))

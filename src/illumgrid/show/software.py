@@ -5,7 +5,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
-from illumgrid.field.levelset import marchable, upward
+from illumgrid.field.levelset import upward
 from illumgrid.field.volume import Floats
 from illumgrid.show.camera import Camera
 from illumgrid.show.shade import Colors, Shown
@@ -37,7 +37,7 @@ def traced(seen: Callable[[Floats], Colors], camera: Camera, width: int, height:
 
 def draw(shown: Shown, camera: Camera, width: int, height: int, background: Colors) -> Colors:
     """Display-linear picture (height, width, 3) of one setting of the sweep."""
-    fields, eye = marchable(shown.scene), shown.scene.to_frame(camera.eye)
+    fields, eye = shown.light.marchable, shown.scene.to_frame(camera.eye)
     axes = shown.scene.fields[0].volume.direction
 
     def seen(directions: Floats) -> Colors:

@@ -173,13 +173,13 @@ LONGEST = 1 << 16
 
 
 def in_turn(solve: _Solve) -> _Solve:
-    """Check what is asked of a `Backend.solve`, and have it answer no more than `LONGEST` paths at once."""
+    """Check what is asked of a `Tracer.solve`, and have it answer no more than `LONGEST` paths at once."""
 
     @wraps(solve)
-    def checked(self: Any, scene: Any, queries: Queries, *, paths: range, bounces: int, seed: int) -> Samples:
+    def checked(self: Any, queries: Queries, *, paths: range, bounces: int, seed: int) -> Samples:
         check_request(paths, bounces)
         parts = [paths[i : i + LONGEST] for i in range(0, len(paths), LONGEST)] or [paths]
-        return reduce(combine, (solve(self, scene, queries, paths=part, bounces=bounces, seed=seed) for part in parts))
+        return reduce(combine, (solve(self, queries, paths=part, bounces=bounces, seed=seed) for part in parts))
 
     return cast(_Solve, checked)
 

@@ -1,7 +1,7 @@
 """A backend with a scene set up: what a scene costs to prepare is paid once, and owned by whoever holds the tracer."""
 
 from dataclasses import dataclass
-from typing import Protocol, cast
+from typing import Any, Protocol, cast
 
 from illumgrid.field.scene import Scene
 from illumgrid.transport.samples import Queries, Samples
@@ -30,3 +30,9 @@ def prepare(backend: Backend, scene: Scene) -> Tracer:
     """Set a scene up for a backend; one that has no method ``prepare`` is asked by its ``solve``."""
     own = getattr(backend, "prepare", None)
     return cast(Tracer, own(scene)) if own else _Unprepared(backend, scene)
+
+
+def solve_once(backend: Any, scene: Scene, queries: Queries, *, paths: range, bounces: int, seed: int) -> Samples:
+    """Set a scene up and answer once: the method ``solve`` of a backend that has ``prepare``."""
+    answer: Samples = backend.prepare(scene).solve(queries, paths=paths, bounces=bounces, seed=seed)
+    return answer

@@ -152,7 +152,7 @@ def _field(light: "Illumination", number: int, stage: Stage, into: Bytes, notes:
     volume = reduced(field.volume, MOST_VOXELS)
     sign = field.upward
     ends = sorted(sign * field.range)
-    steps, base, step, clamped = field_steps(turned(volume, field.inside)[0], (ends[0], ends[1]))
+    steps, base, step, clamped = field_steps(turned(volume, field.inside), (ends[0], ends[1]))
     for what, before, after in (
         ("field", field.volume.shape, volume.shape),
         ("light", whole.spec.shape, grid.spec.shape),
