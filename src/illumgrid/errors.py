@@ -17,6 +17,9 @@ class IllumgridWarning(UserWarning):
 
 WARNINGS = {
     "finite": "voxels that are NaN or infinite were replaced",
+    "spacing": "distances between voxels that a file does not say, or that are doubtful",
+    "placement": "an orientation that was assumed, rounded, or resampled onto right angles",
+    "file": "something in a file that was assumed, or is lost",
     "dicom": "a DICOM series with slices that are missing, unreadable or unevenly spaced",
     "plugin": "a plugin that does not load, or two that claim one name",
     "plateau": "the range holds a value on which the field is flat",

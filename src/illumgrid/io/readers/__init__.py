@@ -1,41 +1,54 @@
-"""Volumes from files: whatever SimpleITK reads, NumPy arrays, and either of them gzipped; and scenes of volumes.
+"""Volumes from files and folders: one reader for each family of files (`families`), and scenes of volumes.
 
-A header is not believed: what it promises is held against the size of the file before anything that large is allocated.
+A header is not believed: what it promises is held against the size of the file and the free memory before anything
+that large is allocated; every byte is counted, every checksum verified; files that a header names lie in its folder.
 """
 
-import gzip
-import io
+import importlib
 import os
 import re
 import struct
 import tokenize
 import zipfile
 import zlib
+from collections.abc import Sequence
 from pathlib import Path
-from tempfile import TemporaryDirectory
+from typing import Any
 
-from illumgrid.errors import BadInput
+from illumgrid.errors import BadInput, tell
 from illumgrid.field.volume import Volume
-from illumgrid.io.readers.arrays import read_npy, read_npz
+from illumgrid.io.readers.families import EXPECTED, FAMILIES, SUFFIXES, Family, family_of
 from illumgrid.io.readers.scene_file import read_scene
-from illumgrid.io.readers.sizes import AGAIN, CHUNK, DEFLATE
+from illumgrid.io.readers.source import find_source
+from illumgrid.io.readers.stored import (
+    Choice,
+    Stored,
+    Wanted,
+    place,
+    with_spacing,
+)
+from illumgrid.io.readers.stored import (
+    crop as cropped,
+)
+from illumgrid.io.readers.stored import (
+    downsample as coarser,
+)
 
 __all__ = ["read_scene", "read_volume", "volume_name"]
 
-KNOWN = {
-    *(".nrrd", ".nhdr", ".nii", ".hdr", ".img", ".mha", ".mhd", ".tif", ".tiff", ".mrc", ".rec", ".map", ".ccp4"),
-    *(".vtk", ".vti", ".dcm", ".ima", ".h5", ".hdf5", ".gipl", ".npy", ".npz"),
-}
-HEADER_FIRST = {".nrrd", ".nii", ".mha", ".mrc", ".rec", ".map", ".vtk", ".gipl"}
-"""Formats that say their size at the beginning; TIFF, HDF5 and zip need not."""
-
-EXPECTED = "expected a NRRD, NIfTI, MetaImage, TIFF, MRC, legacy VTK, .vti, .npy or .npz file or a DICOM folder"
-
 UNREADABLE = (
-    *(RuntimeError, OSError, EOFError, ValueError, TypeError, OverflowError, SyntaxError),
-    *(zipfile.BadZipFile, zlib.error, struct.error, tokenize.TokenError),
+    *(RuntimeError, OSError, EOFError, ValueError, TypeError, OverflowError, SyntaxError, LookupError, ArithmeticError),
+    *(
+        AttributeError,
+        AssertionError,
+        NotImplementedError,
+        zipfile.BadZipFile,
+        zlib.error,
+        struct.error,
+        tokenize.TokenError,
+    ),
 )
-"""What ITK, NumPy and the unpackers raise on a file that is not what it should be."""
+"""What libraries raise on a file that is not what it should be."""
 
 
 def volume_name(path: str | os.PathLike[str]) -> str:
@@ -44,19 +57,39 @@ def volume_name(path: str | os.PathLike[str]) -> str:
     if file.is_dir():
         return file.name
     bare = Path(file.stem) if file.suffix.lower() == ".gz" else file
-    return bare.stem if bare.suffix.lower() in KNOWN else bare.name
+    bare = bare if bare.suffix.lower() not in SUFFIXES else Path(bare.stem)
+    return bare.stem if bare.suffix.lower() == ".ome" else bare.name
 
 
-def read_volume(path: str | os.PathLike[str]) -> Volume:
-    """Read a scalar field from a file or a DICOM folder.
+def read_volume(
+    path: str | os.PathLike[str],
+    *,
+    spacing: Sequence[float] | None = None,
+    channel: Choice = None,
+    time: Choice = None,
+    array: Choice = None,
+    label: int | None = None,
+    crop: Sequence[int] | None = None,
+    downsample: int | None = None,
+) -> Volume:
+    """Read a scalar field from a file, or from a folder of slices.
 
     Parameters
     ----------
     path : str or path-like
-        NRRD, NIfTI, MetaImage, multi-page TIFF, MRC, legacy VTK or anything else that SimpleITK reads; a folder with
-        one DICOM series; `.vti` (with the package `vtk`: its scalars, at the points); `.npy`; `.npz` with one 3D array,
-        or one named `values`, and optional `origin` (3,), `spacing` (3,) and `direction` (3, 3). Each file also gzipped
-        (`brain.nrrd.gz`).
+        NRRD, NIfTI, MetaImage, TIFF (also of ImageJ, OME, LSM), MRC/CCP4, DICOM, legacy VTK, `.vti`, Gaussian `.cube`,
+        OpenDX `.dx`, `.npy` or `.npz`, each also gzipped (`brain.nrrd.gz`); or a folder with one DICOM series or with
+        TIFF slices.
+    spacing : (3,) sequence of float, optional
+        Distance between voxels along x, y, z, in place of what the file says.
+    channel, time, array : int or str, optional
+        Which one of a file that holds several: its number, from 0, or its name.
+    label : int, optional
+        The file is a label map: read a smooth signed distance from the surface of this label, positive inside.
+    crop : (6,) sequence of int, optional
+        First voxel and last + 1 along x, y and z.
+    downsample : int, optional
+        Take means over blocks of so many voxels along each axis.
 
     Returns
     -------
@@ -67,85 +100,91 @@ def read_volume(path: str | os.PathLike[str]) -> Volume:
     Raises
     ------
     BadInput
-        If there is no such file, or it is not one whole real 3D array; the sentence begins with the file's name.
+        If there is no such file, or it does not hold one whole real 3D array, or holds several and none is chosen; the
+        sentence begins with the file's name.
 
     Warns
     -----
     IllumgridWarning
-        If DICOM slices are missing, damaged or unevenly spaced.
+        What was assumed or is lost.
     """
     if not os.fspath(path):
         raise BadInput(f"the name of the volume is empty; {EXPECTED}")  # and not the folder one is in
     file = Path(os.path.abspath(path))
+    shown = file.name.encode("utf-8", "replace").decode()
     try:
-        return _read(file)
+        stored = _read(file, Wanted(channel, time, array))
+        if spacing is not None:
+            stored = with_spacing(stored, spacing)
+        if crop is not None:
+            stored = cropped(stored, crop)
+        if label is not None:
+            from illumgrid.io.readers.labels import distance_to
+
+            stored = distance_to(stored, label)
+        if downsample is not None:
+            stored = coarser(stored, downsample)
+        volume, notes = place(stored)
     except BadInput as problem:
-        raise BadInput(f"{file.name}: {problem}") from None
+        raise BadInput(f"{shown}: {problem}") from None
     except MemoryError as problem:
-        raise BadInput(f"{file.name}: too large for the memory of this machine; expected less; coarsen it") from problem
+        raise BadInput(f"{shown}: too large for the memory of this machine; expected less; coarsen it") from problem
     except UNREADABLE as problem:
-        raise BadInput(
-            f"{file.name}: cannot be read ({_reason(problem)}); {EXPECTED}; check that it is whole and rightly named"
-        ) from problem
+        raise BadInput(f"{shown}: was not understood ({_reason(problem)}); {EXPECTED}") from problem
+    for name, sentence in notes:
+        tell(name, f"{shown}: {sentence}", stacklevel=2)
+    return volume
 
 
 def _reason(problem: BaseException) -> str:
-    """Say what an exception says, in one line: ITK tells its source file and an address first."""
-    # MetaImage gives a reason that is none (what errno happens to be); folders may be temporary.
+    """What an exception says, in one line: ITK begins with its source file and an address; folders are left out."""
     text = re.sub(r"(?s).*(sitk::|ITK )ERROR:|\w+\(0x[0-9a-f]+\): |\. Reason: .*|/\S+/", "", str(problem))
+    text = "".join(c if c.isprintable() else " " for c in text)
     return re.sub(r"[.!?:]+ ", ", ", " ".join(text.split())).rstrip(".!")[-200:] or type(problem).__name__
 
 
-def _read(file: Path) -> Volume:
+def _read(file: Path, wanted: Wanted) -> Stored:
     if file.is_dir():
-        from illumgrid.io.readers.itk import read_dicom
-
-        return read_dicom(file)
+        return _read_folder(file, wanted)
     if not file.exists():
         raise BadInput(f"there is no such file; {EXPECTED}; check the path")
     if not file.is_file():
         raise BadInput(f"neither a file nor a folder; {EXPECTED}; copy the data into a file")
-    size = file.stat().st_size
-    if size == 0:
-        raise BadInput(f"the file is empty; {EXPECTED}; fetch or write it again")
-    if file.suffix.lower() != ".gz":
-        return _read_unpacked(file, size)
-    if file.stem.lower().endswith(".npy"):
-        with gzip.open(file) as unpacked:
-            return Volume(read_npy(io.BufferedReader(unpacked), size * DEFLATE))
-    with TemporaryDirectory(prefix="illumgrid-") as folder:
-        inner = Path(folder) / file.stem
-        _unpack(file, inner, size * DEFLATE)
-        return _read_unpacked(inner, size)
+    source = find_source(file)
+    if source.size == 0:
+        raise BadInput(f"the file is empty; {EXPECTED}; copy or write it again")
+    family = family_of(source)
+    _check_choice(family, wanted)
+    stored: Stored = _module(family).read(source, wanted)
+    return stored
 
 
-def _read_unpacked(file: Path, size: int) -> Volume:
-    """Read a file that is not gzipped; `size` is that of the file it came from: a bomb within a bomb gains nothing."""
-    ending = file.suffix.lower()
-    if ending == ".npz":
-        return read_npz(file, size * DEFLATE)
-    if ending == ".npy":
-        with open(file, "rb") as stream:
-            return Volume(read_npy(stream, size))
-    if ending == ".vti":
-        from illumgrid.io.readers.vti import read_vti
-
-        return read_vti(file, size * DEFLATE)
-    from illumgrid.io.readers.itk import read_image
-
-    return read_image(file, size * DEFLATE)
+def _read_folder(folder: Path, wanted: Wanted) -> Stored:
+    """A folder of DICOM files, or else of TIFF slices."""
+    dicom, tiff = (next(f for f in FAMILIES if f.name == name) for name in ("DICOM", "TIFF"))
+    slices = sorted(f for f in folder.iterdir() if f.suffix.lower() in (".tif", ".tiff"))
+    plain = [f for f in slices if family_of(find_source(f)) is tiff]
+    family = tiff if plain and not any(f.suffix.lower() in dicom.endings for f in folder.iterdir()) else dicom
+    _check_choice(family, wanted)
+    module = _module(family)
+    stored: Stored = module.read_folder(plain, wanted) if family is tiff else module.read_folder(folder, wanted)
+    return stored
 
 
-def _unpack(file: Path, inner: Path, most: int) -> None:
-    """Decompress `file` into `inner`: not more than `most` bytes, nor than its own header asks for."""
-    from illumgrid.io.readers.itk import unpacked_bytes
+def _module(family: Family) -> Any:
+    try:
+        return importlib.import_module(f"illumgrid.io.readers.{family.module}")
+    except ImportError as problem:
+        if problem.name and problem.name.startswith("illumgrid"):
+            raise
+        package = (problem.name or "").partition(".")[0]
+        raise BadInput(
+            f"is read by the package {package}, which is not installed; expected it beside illumgrid; install it"
+        ) from problem
 
-    with gzip.open(file) as packed, open(inner, "wb") as out:
-        done = out.write(packed.read(CHUNK))
-        out.flush()
-        if done == CHUNK and inner.suffix.lower() in HEADER_FIRST:
-            most = min(most, unpacked_bytes(inner))
-        while chunk := packed.read(CHUNK):
-            done += out.write(chunk)
-            if done > most:
-                raise BadInput(f"unpacks to more than the {most} bytes that its header promises; {AGAIN}")
+
+def _check_choice(family: Family, wanted: Wanted) -> None:
+    for option in ("channel", "time", "array"):
+        if getattr(wanted, option) is not None and option not in family.chooses:
+            known = ", ".join(f"--{name}" for name in family.chooses) or "none of these options"
+            raise BadInput(f"--{option} came with a {family.name} file; expected {known}; leave --{option} out")

@@ -1,64 +1,112 @@
 """NumPy's own files: .npy and .npz. Nothing is unpickled."""
 
 import io
-import math
 import struct
 import warnings
 import zipfile
-from collections.abc import Sequence
-from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from illumgrid.errors import BadInput
-from illumgrid.field.volume import Volume
-from illumgrid.io.readers.sizes import AGAIN, CHUNK, DEFLATE, check_axes, check_size
+from illumgrid.io.readers.limits import DEFLATE, check_axes, check_size
+from illumgrid.io.readers.source import Source, finish, opened, read_array, seekable
+from illumgrid.io.readers.stored import Choice, Stored, Wanted, pick
+
+Header = tuple[tuple[int, ...], bool, np.dtype[Any], int]
+"""Shape, whether in Fortran order, dtype, and how many bytes come before the data."""
 
 
-def read_npy(stream: IO[bytes], most: int) -> NDArray[Any]:
-    """Read the one array of a .npy stream that holds at most `most` bytes."""
-    shape, fortran, dtype, start = _header(stream)
-    if dtype.kind not in "biuf":
-        raise BadInput(f"the values have dtype {dtype}; expected real numbers; save the magnitude or one component")
-    check_axes(shape)
-    count = math.prod(shape)
-    check_size(start + count * dtype.itemsize, most, count * (dtype.itemsize + 4))
-    return _fill(stream, shape, fortran, dtype)
+def read(source: Source, wanted: Wanted) -> Stored:
+    """Read a .npy file, or one 3D array of a .npz file: the only one, that named `values`, or that of `--array`."""
+    if source.head.startswith(b"PK"):
+        with seekable(source) as stream, zipfile.ZipFile(stream) as pack:
+            return _read_npz(pack, wanted, source.size * DEFLATE)
+    if wanted.array is not None:
+        raise BadInput("--array came with a .npy file, which holds one array; leave --array out")
+    with opened(source) as stream:
+        return Stored(_read_npy(stream, source.most, wanted), np.zeros(3), np.eye(3))
 
 
-def read_npz(file: Path, most: int) -> Volume:
-    """Read the one 3D array of a .npz file, or that named `values`; the file unpacks to at most `most` bytes."""
-    with zipfile.ZipFile(file) as pack:
-        members = {info.filename[:-4]: info for info in pack.infolist() if info.filename.endswith(".npy")}
-        shapes = {name: _shape(pack, info) for name, info in members.items()}
-        cubes = ["values"] if "values" in shapes else [name for name, shape in shapes.items() if len(shape) == 3]
-        if len(cubes) != 1:
-            found = ", ".join(f"{name} {shape}" for name, shape in list(shapes.items())[:8]) or "none"
-            raise BadInput(f"its arrays are: {found}; expected one with three axes; name the right one 'values'")
-        places = {name: _place(pack, members[name]) for name in ("origin", "spacing", "direction") if name in members}
-        info = members[cubes[0]]
-        unpacked = info.compress_size * (DEFLATE if info.compress_type == zipfile.ZIP_DEFLATED else 1)
-        with pack.open(info) as stream:
-            return Volume(read_npy(stream, min(most, info.file_size, unpacked)), **places)
+def _read_npz(pack: zipfile.ZipFile, wanted: Wanted, most: int) -> Stored:
+    members = {info.filename[:-4]: info for info in pack.infolist() if info.filename.endswith(".npy")}
+    heads = {name: _head_of(pack, info) for name, info in members.items()}
+    name = _choose({name: head[0] for name, head in heads.items()}, wanted.array)
+    places = {key: _place(pack, members[key]) for key in ("origin", "spacing", "direction") if key in members}
+    info = members[name]
+    unpacked = info.compress_size * (DEFLATE if info.compress_type == zipfile.ZIP_DEFLATED else 1)
+    with pack.open(info) as stream:  # zipfile compares the checksum where the member ends
+        values = _read_npy(stream, min(most, info.file_size, unpacked), wanted)
+    spacing = places.get("spacing", np.ones(3))
+    if spacing.shape != (3,) or not np.isfinite(spacing).all() or not (spacing > 0).all():
+        raise BadInput(f"spacing is {spacing.tolist()}; expected three positive numbers (a flip belongs in direction)")
+    direction = places.get("direction", np.eye(3))
+    if direction.shape != (3, 3):
+        raise BadInput(f"direction is {direction.tolist()}; expected a 3x3 matrix whose columns are orthonormal")
+    return Stored(values, places.get("origin", np.zeros(3)), direction * spacing)
 
 
-def _shape(pack: zipfile.ZipFile, info: zipfile.ZipInfo) -> tuple[int, ...]:
+def _choose(shapes: dict[str, tuple[int, ...]], array: Choice) -> str:
+    """Name of the array that is the volume."""
+    cubes = [name for name, shape in shapes.items() if len(shape) in (3, 4) and min(shape[:2]) > 1 and shape != (3, 3)]
+    if array is None and "values" in shapes:
+        return "values"
+    if not cubes:
+        found = ", ".join(f"{name} {shape}" for name, shape in list(shapes.items())[:8]) or "none"
+        raise BadInput(f"its arrays are: {found}; expected one with three axes")
+    if isinstance(array, str) and array in cubes:
+        return array
+    labels = [f"{name} {'x'.join(map(str, shapes[name]))}" for name in cubes]
+    return cubes[pick(array, "array", labels)]
+
+
+def _head_of(pack: zipfile.ZipFile, info: zipfile.ZipInfo) -> Header:
     with pack.open(info) as stream:
-        return _header(stream)[0]
+        return _header(stream)
 
 
-def _place(pack: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDArray[Any]:
+def _place(pack: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDArray[np.float64]:
     with pack.open(info) as stream:
         shape, fortran, dtype, _ = _header(stream)
         if dtype.kind not in "iuf" or shape not in ((3,), (3, 3)):
             raise BadInput(f"{info.filename} has shape {shape}, dtype {dtype}; expected 3 or 3x3 numbers; leave it out")
-        return _fill(stream, shape, fortran, dtype)
+        return read_array(stream, dtype, shape, "F" if fortran else "C").astype(float)
 
 
-def _header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any], int]:
-    """Shape, whether in Fortran order, dtype, and how many bytes come before the data."""
+def _read_npy(stream: IO[bytes], most: int, wanted: Wanted) -> NDArray[Any]:
+    """Read the one array of a .npy stream that holds at most `most` bytes."""
+    shape, fortran, dtype, start = _header(stream)
+    if dtype.kind not in "biuf":
+        raise BadInput(f"the values have dtype {dtype}; expected real numbers; save the magnitude or one component")
+    if not 3 <= len(shape) <= 5 or min(shape) < 1:
+        check_axes(shape)
+    count = int(np.prod([float(n) for n in shape]))
+    check_size(start + count * dtype.itemsize, most, count * dtype.itemsize)
+    values = read_array(stream, dtype, shape, "F" if fortran else "C")
+    if finish(stream, spare=0):
+        raise BadInput("has more data than its header promises; expected one array; write it again")
+    return _three_axes(values, wanted)
+
+
+def _three_axes(values: NDArray[Any], wanted: Wanted) -> NDArray[Any]:
+    """Of more than three axes: `--time N` takes [N, ...], `--channel N` [..., N]; axes of length 1 are dropped."""
+    shape = "x".join(map(str, values.shape))
+    if values.ndim > 3 and wanted.time is not None:
+        values = values[pick(wanted.time, "time", [""] * len(values))]
+    if values.ndim > 3 and wanted.channel is not None:
+        values = values[..., pick(wanted.channel, "channel", [""] * values.shape[-1])]
+    while values.ndim > 3 and 1 in (values.shape[0], values.shape[-1]):
+        values = values[0] if values.shape[0] == 1 else values[..., 0]
+    if values.ndim > 3:
+        raise BadInput(
+            f"has {values.ndim} axes ({shape}); expected three, x, y and z; choose one time step along the first axis "
+            "with --time N, or one channel along the last with --channel N"
+        )
+    return values
+
+
+def _header(stream: IO[bytes]) -> Header:
     start = stream.read(12)
     if len(start) < 12 or not start.startswith(b"\x93NUMPY"):
         raise BadInput("does not begin like a .npy array; expected what numpy.save writes; write it again")
@@ -72,17 +120,3 @@ def _header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any], in
         warnings.simplefilter("ignore")  # Python 2 wrote sizes like 3L, which are as good
         shape, fortran, dtype = parse(text)
     return shape, fortran, dtype, 10 + length
-
-
-def _fill(stream: IO[bytes], shape: Sequence[int], fortran: bool, dtype: np.dtype[Any]) -> NDArray[Any]:
-    flat = np.empty(math.prod(shape), dtype)
-    raw = memoryview(flat.view(np.uint8))  # type: ignore[arg-type]
-    done = 0
-    while done < len(raw):
-        got = stream.readinto(raw[done : done + CHUNK])  # type: ignore[attr-defined]
-        if not got:
-            raise BadInput(f"ends after {done} of {len(raw)} bytes of data; {AGAIN}")
-        done += got
-    if stream.read(1):
-        raise BadInput(f"has more data than its {'x'.join(map(str, shape))} values; expected one array; write it again")
-    return flat.reshape(shape, order="F" if fortran else "C")

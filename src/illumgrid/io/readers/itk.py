@@ -7,18 +7,49 @@ import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from tempfile import TemporaryDirectory
+from typing import IO, Any
 
 import numpy as np
 import SimpleITK as sitk  # noqa: N813  (its usual name)
 
 from illumgrid.errors import BadInput, tell
-from illumgrid.field.volume import Volume
 from illumgrid.io.readers.heads import check_head
 from illumgrid.io.readers.sizes import CHUNK, DEFLATE, check_axes, check_size, check_tiff, check_words, on_disk
+from illumgrid.io.readers.source import Source, opened
+from illumgrid.io.readers.stored import Stored, Wanted
 
 
-def read_image(file: Path, most: int) -> Volume:
+def read(source: Source, wanted: Wanted) -> Stored:
+    """Read what SimpleITK reads; a gzipped file is unpacked first."""
+    if not source.packed:
+        return read_image(source.file, source.size * DEFLATE)
+    with TemporaryDirectory(prefix="illumgrid-") as folder, opened(source) as packed:
+        inner = Path(folder) / source.name
+        _unpack(packed, inner, source.most)
+        return read_image(inner, source.size * DEFLATE)
+
+
+def _unpack(packed: IO[bytes], inner: Path, most: int) -> None:
+    """Decompress into `inner`: not more than `most` bytes, nor than its own header asks for."""
+    with open(inner, "wb") as out:
+        done = out.write(packed.read(CHUNK))
+        out.flush()
+        if done == CHUNK and inner.suffix.lower() in HEADER_FIRST:
+            most = min(most, unpacked_bytes(inner))
+        while chunk := packed.read(CHUNK):
+            done += out.write(chunk)
+            if done > most:
+                raise BadInput(
+                    f"unpacks to more than the {most} bytes of its header; expected a whole file; write it again"
+                )
+
+
+HEADER_FIRST = {".nrrd", ".nii", ".mha", ".mrc", ".rec", ".map", ".vtk", ".gipl"}
+"""Formats that say their size at the beginning; TIFF, HDF5 and zip need not."""
+
+
+def read_image(file: Path, most: int) -> Stored:
     """Read an image file; if it is packed, its data unpack to at most `most` bytes."""
     with _quiet():
         check_tiff(file)
@@ -42,7 +73,7 @@ def unpacked_bytes(file: Path) -> int:
     return CHUNK + disk.start + voxels * (32 if disk.form == "text" else disk.width + 1)
 
 
-def read_dicom(folder: Path) -> Volume:
+def read_folder(folder: Path, wanted: Wanted) -> Stored:
     """Read the one series of a folder that is a stack of slices."""
     with _quiet():
         find = sitk.ImageSeriesReader
@@ -100,9 +131,10 @@ def _frames(file: str) -> int:
     return int((*_open(file).GetSize(), 1)[2])
 
 
-def _volume(image: Any) -> Volume:
-    values = sitk.GetArrayViewFromImage(image).T  # ITK's arrays are z, y, x; Volume makes the one copy
-    return Volume(values, image.GetOrigin(), image.GetSpacing(), np.reshape(image.GetDirection(), (3, 3)))
+def _volume(image: Any) -> Stored:
+    values = sitk.GetArrayFromImage(image).T  # ITK's arrays are z, y, x
+    steps = np.reshape(image.GetDirection(), (3, 3)) * image.GetSpacing()
+    return Stored(values, np.array(image.GetOrigin()), steps)
 
 
 def _warn_of_damaged(folder: Path, used: set[str]) -> None:

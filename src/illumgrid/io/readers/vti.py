@@ -4,19 +4,31 @@ import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 
 from illumgrid.errors import BadInput
-from illumgrid.field.volume import Volume
-from illumgrid.io.readers.sizes import AGAIN, CHUNK, check_axes, check_size
+from illumgrid.io.readers.limits import CHUNK, DEFLATE, check_axes, check_size
+from illumgrid.io.readers.source import AGAIN, Source, opened
+from illumgrid.io.readers.stored import Stored, Wanted
 
 NEEDED = "is VTK image data, which only VTK reads; expected the package vtk beside illumgrid: pip install vtk"
 
 
-def read_vti(file: Path, most: int) -> Volume:
-    """Read the scalar field of an image data file; if it is packed, its data unpack to at most `most` bytes."""
+def read(source: Source, wanted: Wanted) -> Stored:
+    """Read the scalar field of an image data file."""
+    if not source.packed:
+        return _read(source.file, source.size * DEFLATE)
+    with TemporaryDirectory(prefix="illumgrid-") as folder, opened(source) as packed:
+        inner = Path(folder) / source.name
+        inner.write_bytes(packed.read(source.most))
+        return _read(inner, source.size * DEFLATE)
+
+
+def _read(file: Path, most: int) -> Stored:
+    """Read a file whose data, if packed, unpack to at most `most` bytes."""
     try:
         from vtkmodules.util.numpy_support import vtk_to_numpy
         from vtkmodules.vtkIOXML import vtkXMLImageDataReader
@@ -54,7 +66,7 @@ def read_vti(file: Path, most: int) -> Volume:
         direction = np.array([[matrix.GetElement(row, axis) for axis in range(3)] for row in range(3)])
         spacing = np.array(image.GetSpacing())
         origin = np.array(image.GetOrigin()) + direction @ (spacing * np.array(image.GetExtent()[::2]))
-        return Volume(vtk_to_numpy(values).reshape(shape, order="F"), origin, spacing, direction)
+        return Stored(vtk_to_numpy(values).reshape(shape, order="F"), origin, direction * spacing)
 
 
 @contextmanager

@@ -1,0 +1,107 @@
+"""The families of files that hold volumes: how each is recognised, which module reads it, what one can choose in it."""
+
+import re
+from dataclasses import dataclass
+
+from illumgrid.errors import BadInput
+from illumgrid.io.readers.source import Source
+
+
+@dataclass(frozen=True)
+class Family:
+    """A kind of file, read by `read(source, wanted)` of its module, which gives a `Stored`.
+
+    A family of folders has `read_folder(files, wanted)` as well.
+    """
+
+    name: str
+    module: str
+    """Within `illumgrid.io.readers`; imported where it is needed."""
+    endings: tuple[str, ...]
+    starts: tuple[tuple[int, bytes], ...] = ()
+    """Bytes at a place, each of which says that a file is of this family, whatever its name."""
+    chooses: tuple[str, ...] = ()
+    """Options that choose one volume of several: channel, time, array."""
+    medical: bool = False
+    """World coordinates are LPS millimetres."""
+
+
+FAMILIES = (
+    # DICOM first: its preamble may look like a TIFF.
+    Family("DICOM", "itk", (".dcm", ".ima"), ((128, b"DICM"),), ("time", "array"), True),
+    Family(
+        *("TIFF", "itk", (".tif", ".tiff", ".lsm", ".btf")),
+        starts=((0, b"II*\0"), (0, b"MM\0*"), (0, b"II+\0"), (0, b"MM\0+")),
+        chooses=("channel", "time", "array"),
+    ),
+    Family("NRRD", "itk", (".nrrd", ".nhdr"), ((0, b"NRRD000"),), ("channel", "time"), True),
+    Family(
+        *("NIfTI", "itk", (".nii", ".hdr", ".img")),
+        starts=((344, b"n+1\0"), (344, b"ni1\0"), (4, b"n+2\0\r\n"), (4, b"ni2\0\r\n")),
+        chooses=("channel", "time"),
+        medical=True,
+    ),
+    Family(
+        *("MetaImage", "itk", (".mha", ".mhd")),
+        starts=((0, b"ObjectType"), (0, b"NDims")),
+        chooses=("channel", "time"),
+        medical=True,
+    ),
+    Family(
+        *("MRC", "itk", (".mrc", ".mrcs", ".rec", ".map", ".ccp4", ".st", ".ali")),
+        starts=((208, b"MAP "), (208, b"MAP\0")),
+        chooses=("array",),
+    ),
+    Family(
+        *("NumPy", "arrays", (".npy", ".npz")),
+        starts=((0, b"\x93NUMPY"), (0, b"PK\x03\x04")),
+        chooses=("channel", "time", "array"),
+    ),
+    Family("legacy VTK", "itk", (".vtk",), ((0, b"# vtk DataFile"),), ("array",)),
+    Family("VTK image", "vti", (".vti",), ((0, b"<VTKFile"), (0, b"<?xml")), ("array",)),
+    Family("ITK", "itk", (".gipl", ".h5", ".hdf5"), ((0, b"\x89HDF\r\n\x1a\n"),)),
+)
+"""In the order in which they are tried."""
+
+OTHERS = {
+    b"\x89PNG": "a PNG picture",
+    b"\xff\xd8\xff": "a JPEG picture",
+    b"GIF8": "a GIF picture",
+    b"%PDF": "a PDF document",
+    b"BM": "a bitmap picture",
+    b"\x76\x2f\x31\x01": "an OpenEXR picture",
+    b"ply\n": "a PLY mesh",
+    b"glTF": "a glTF mesh",
+    b"BZh": "packed by bzip2",
+    b"\xfd7zXZ\0": "packed by xz",
+    b"\x28\xb5\x2f\xfd": "packed by zstd",
+    b"MATLAB 5": "a MATLAB file",
+    b"CDF\x01": "a NetCDF file",
+    b"CDF\x02": "a NetCDF file",
+    b"version https://git-lfs": "a pointer of Git LFS, in place of the data",
+    b"<!DOCTYPE": "a web page",
+    b"<html": "a web page",
+}
+"""Beginnings of files of other kinds, and what those are."""
+
+EXPECTED = (
+    "expected NRRD, NIfTI, MetaImage, TIFF, MRC, legacy VTK, .vti, .cube, .dx, .npy or .npz, or a folder of DICOM or "
+    "TIFF slices"
+)
+
+SUFFIXES = {ending for family in FAMILIES for ending in family.endings}
+
+
+def family_of(source: Source) -> Family:
+    """The family of a file: its first bytes count, then the ending of its name."""
+    for family in FAMILIES:
+        if any(source.head[at : at + len(mark)] == mark for at, mark in family.starts):
+            return family
+    for mark, what in OTHERS.items():
+        if source.head.startswith(mark):
+            raise BadInput(f"{what}; {EXPECTED}; save the volume as one of those")
+    for family in FAMILIES:
+        if source.ending in family.endings:
+            return family
+    ending = re.sub(r"[^\w.+-]", "?", source.ending) or "none"
+    raise BadInput(f"neither its first bytes nor its ending ({ending}) are those of a volume; {EXPECTED}")

@@ -1,0 +1,185 @@
+"""What a reader hands over: values as they are stored, where they lie, and what the user should know about them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from illumgrid.errors import BadInput
+from illumgrid.field.volume import Floats, Volume
+from illumgrid.io.readers.limits import AS_FLOAT, check_axes, check_memory
+
+Choice = int | str | None
+"""Number (from 0) or name of a channel, time step or array; None where the user chose none."""
+
+Note = tuple[str, str]
+"""Name of a warning (in `errors.WARNINGS`) and its sentence, without the file's name."""
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What the user chooses of a file that holds several volumes."""
+
+    channel: Choice = None
+    time: Choice = None
+    array: Choice = None
+
+
+@dataclass(frozen=True)
+class Stored:
+    """One volume of a file. Its values are `slope` · stored + `intercept`."""
+
+    values: NDArray[Any]
+    """(nx, ny, nz) real numbers in the type of the file, any memory order."""
+    origin: Floats
+    """(3,) world position of voxel (0, 0, 0)."""
+    steps: Floats
+    """(3, 3): column i is the world vector from a voxel to its neighbour along axis i; it may shear."""
+    slope: float = 1.0
+    intercept: float = 0.0
+    unit: str | None = None
+    """Of the world coordinates: "mm", "µm", "Å"."""
+    notes: tuple[Note, ...] = ()
+
+
+def pick(chosen: Choice, option: str, names: Sequence[str]) -> int:
+    """Number of the channel, time step or array that the user wants; several without a choice are refused.
+
+    Parameters
+    ----------
+    chosen : int, str or None
+        What the user said: a number from 0, or one of `names`.
+    option : str
+        "channel", "time" or "array".
+    names : sequence of str
+        What each is called in the file; empty texts where it does not say.
+    """
+    listed = ", ".join(f"{number} {name}".strip() for number, name in enumerate(names))
+    listed = listed if len(listed) < 400 else f"{listed[:380]}… up to {len(names) - 1}"
+    kinds = {"channel": "channels", "time": "time steps", "array": "arrays"}[option]
+    if chosen is None and len(names) == 1:
+        return 0
+    if chosen is None:
+        raise BadInput(f"holds {len(names)} {kinds}: {listed}; expected one; choose it with --{option} N ({option}=N)")
+    if isinstance(chosen, str) and chosen in names:
+        return names.index(chosen)
+    if (isinstance(chosen, int) or chosen.isdecimal()) and 0 <= int(chosen) < len(names):
+        return int(chosen)
+    raise BadInput(f"--{option} is {chosen}; expected one of its {kinds}: {listed}")
+
+
+def crop(stored: Stored, box: Sequence[int]) -> Stored:
+    """The voxels from box[0] up to (not with) box[1] along x, box[2] to box[3] along y, box[4] to box[5] along z."""
+    shape = stored.values.shape
+    first, last = np.array(box[::2]), np.array(box[1::2])
+    if len(box) != 6 or (first < 0).any() or (last > shape).any() or (last - first < 2).any():
+        raise BadInput(
+            f"--crop is {' '.join(map(str, box))}; expected first and last + 1 along x, y and z, at least 2 voxels "
+            f"within 0 {shape[0]} 0 {shape[1]} 0 {shape[2]}"
+        )
+    values = stored.values[tuple(slice(int(a), int(b)) for a, b in zip(first, last))]
+    return replace(stored, values=values, origin=stored.origin + stored.steps @ first)
+
+
+def downsample(stored: Stored, factor: int) -> Stored:
+    """Means over blocks of factor³ voxels; what does not fill a block at the upper ends is left out."""
+    shape = np.array(stored.values.shape)
+    if not 1 <= factor <= shape.min() // 2:
+        raise BadInput(
+            f"--downsample is {factor}; expected 1 to {shape.min() // 2}, which leaves 2 voxels along each axis"
+        )
+    if factor == 1:
+        return stored
+    blocks = shape // factor
+    total = np.zeros(blocks)
+    for offset in np.ndindex(factor, factor, factor):
+        total += stored.values[tuple(slice(o, o + n * factor, factor) for o, n in zip(offset, blocks))]
+    total /= factor**3
+    values = total if stored.values.dtype == np.float64 else total.astype(np.float32)
+    centre = np.full(3, (factor - 1) / 2)
+    return replace(stored, values=values, origin=stored.origin + stored.steps @ centre, steps=stored.steps * factor)
+
+
+def with_spacing(stored: Stored, spacing: Sequence[float]) -> Stored:
+    """The same with other distances between voxels, and without the warnings about those of the file."""
+    step = np.array(spacing, float)
+    if step.shape != (3,) or not np.isfinite(step).all() or not (step > 0).all():
+        raise BadInput(f"--spacing is {' '.join(map(str, np.ravel(spacing)))}; expected three positive numbers: X Y Z")
+    notes = tuple(note for note in stored.notes if note[0] != "spacing")
+    return replace(stored, steps=stored.steps / np.linalg.norm(stored.steps, axis=0) * step, notes=notes)
+
+
+SKEW = 0.005
+"""Cosine of the angle between axes that is still taken for a right one (0.3°): rounding in a header."""
+
+
+def place(stored: Stored) -> tuple[Volume, tuple[Note, ...]]:
+    """The volume, resampled onto right angles where the axes of the file are oblique to each other; and its notes."""
+    check_axes(stored.values.shape)
+    if not (np.isfinite(stored.steps).all() and np.isfinite(stored.origin).all()):
+        raise BadInput("its spacing or orientation is not finite; expected numbers; mend its header or give --spacing")
+    spacing = np.linalg.norm(stored.steps, axis=0)
+    if not (spacing > 0).all():
+        raise BadInput(
+            f"its spacing is {spacing.tolist()}; expected three positive numbers; give it with --spacing X Y Z"
+        )
+    if abs(np.linalg.det(stored.steps / spacing)) < 1e-3:
+        raise BadInput(f"its axes are {stored.steps.T.tolist()}; expected three different directions; mend its header")
+    direction = stored.steps / spacing
+    notes = stored.notes
+    skew = float(np.abs(direction.T @ direction - np.eye(3)).max())
+    if skew > SKEW:
+        stored = unsheared(stored)
+        spacing = np.linalg.norm(stored.steps, axis=0)
+        direction = stored.steps / spacing
+        notes = (*notes, ("placement", _SHEARED.format(90 - np.degrees(np.arccos(min(1.0, skew))))))
+    elif skew > 1e-3:
+        notes = (
+            *notes,
+            ("placement", f"its axes are {np.degrees(skew):.2f}° off right angles, which was rounded away"),
+        )
+    u, _, v = np.linalg.svd(direction)
+    exact = direction if skew < 1e-14 else u @ v
+    values = stored.values
+    if stored.slope != 1 or stored.intercept != 0:
+        check_memory(values.size * (8 + AS_FLOAT))
+        values = values * np.float64(stored.slope) + np.float64(stored.intercept)
+    else:
+        check_memory(values.size * AS_FLOAT)
+    return Volume(values, stored.origin, spacing, exact), notes
+
+
+_SHEARED = (
+    "its axes are up to {:.1f}° off right angles; it was resampled onto right angles by linear interpolation; where "
+    "the new box has no data its values are NaN"
+)
+
+
+def unsheared(stored: Stored) -> Stored:
+    """Resampled onto a box of right angles around the sheared one: its first axis is kept, its first plane is kept.
+
+    World position is Q R · index with Q orthonormal and R upper triangular: along the new axes, Q, only whole planes
+    and rows move.
+    """
+    from scipy.ndimage import map_coordinates
+
+    q, r = np.linalg.qr(stored.steps)
+    turn = np.sign(np.diag(r))
+    q, r = q * turn, r * turn[:, None]
+    step = np.diag(r)
+    top = np.array(stored.values.shape) - 1.0
+    corners = np.array(list(np.ndindex(2, 2, 2))) * top @ (r / step[:, None]).T
+    low = np.floor(corners.min(axis=0) + 1e-6).astype(int)
+    shape = np.ceil(corners.max(axis=0) - 1e-6).astype(int) - low + 1
+    check_memory(int(np.prod(shape.astype(float))) * (AS_FLOAT + 8) + stored.values.size * 8)
+    values = np.asarray(stored.values, np.float64 if stored.values.dtype.itemsize > 4 else np.float32)
+    out = np.empty(shape, values.dtype)
+    back = np.linalg.inv(r / step[:, None])  # from the new index to the old one
+    i, j = np.meshgrid(np.arange(shape[0]) + low[0], np.arange(shape[1]) + low[1], indexing="ij")
+    for k in range(shape[2]):
+        old = np.tensordot(back, np.stack([i, j, np.full(i.shape, k + low[2])]).astype(float), 1)
+        old = np.where(np.abs(old - np.round(old)) < 1e-6, np.round(old), old)
+        out[:, :, k] = map_coordinates(values, old, order=1, mode="constant", cval=np.nan)
+    return replace(stored, values=out, origin=stored.origin + q @ (step * low), steps=q * step)
