@@ -2,12 +2,14 @@
 
 import sys
 import warnings
+from types import SimpleNamespace
 
 import pytest
 
 import illumgrid as ig
 from illumgrid import registry
 from illumgrid.registry.options import options, parse, short
+from illumgrid.transport.stages import Capabilities, capabilities
 from shapes import refused
 
 SAMPLER = """
@@ -187,6 +189,28 @@ def test_a_backend_says_what_it_traces(install):
     )
     install("vague", source)
     assert "geometry is None; expected 'mesh', 'levelset' or 'both'" in told()[0]
+
+
+@pytest.mark.parametrize(
+    "geometry, options, surface, variants",
+    [
+        ("mesh", {}, "mesh", ()),
+        ("levelset", {}, "levelset", ()),
+        ("both", {}, "levelset", ()),
+        ("both", {"surface": "auto"}, "levelset", ("levelset", "mesh")),
+        ("both", {"surface": "mesh"}, "mesh", ("levelset", "mesh")),
+    ],
+)
+def test_what_a_backend_can_do_is_read_from_its_class_and_its_option(geometry, options, surface, variants):
+    assert capabilities(SimpleNamespace(geometry=geometry, **options)) == Capabilities(surface, True, variants)
+    dark = SimpleNamespace(geometry=geometry, transport=False, **options)
+    assert capabilities(dark) == Capabilities(surface, False, variants)
+
+
+def test_every_backend_is_listed_once_per_surface():
+    titles = [title for title, _, _ in registry.backends()]
+    assert [title for title in titles if title != "embree"][:3] == ["numba:levelset", "numba:mesh", "reference"]
+    assert all(can == capabilities(stage) for _, stage, can in registry.backends())
 
 
 def test_of_two_hooks_in_a_package_one_may_be_broken(install):

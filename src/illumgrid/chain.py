@@ -20,6 +20,7 @@ from illumgrid.grid import IlluminationGrid
 from illumgrid.io import store
 from illumgrid.light import Illumination
 from illumgrid.stages import Backend, Interpolator, Sampler
+from illumgrid.transport.stages import capabilities
 from illumgrid.transport.tracer import prepare
 
 
@@ -163,7 +164,7 @@ def _check_plannable(error: float | None, seconds: float | None, sampler: Any, b
         raise BadInput(f"an error of {error:g} was asked for; expected a share of the mean light, such as 0.03")
     if seconds is not None and not 0 < seconds < np.inf:
         raise BadInput(f"{seconds:g} seconds were asked for; expected a positive number")
-    if (sampler.name, interpolator.name) != ("direct", "nearest") or backend.geometry == "mesh":
+    if (sampler.name, interpolator.name) != ("direct", "nearest") or capabilities(backend).surface == "mesh":
         raise BadInput(
             f"an error or a time was asked for with {sampler.name}, {backend.name} and {interpolator.name}; expected "
             "direct, a backend that marches level sets, and nearest: 'illumgrid bench' measures the others"

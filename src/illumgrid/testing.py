@@ -20,6 +20,7 @@ from illumgrid.registry.options import expected, options
 from illumgrid.stages import on_level_sets
 from illumgrid.transport.analytic import CASES, on_quad
 from illumgrid.transport.samples import Queries, Samples, combine, join_queries
+from illumgrid.transport.stages import capabilities
 
 __all__ = ["BackendTests", "InterpolatorTests", "SamplerTests"]
 
@@ -255,7 +256,7 @@ class BackendTests(_StageTests):
     def test_light_is_as_its_closed_forms_say(self) -> None:
         """Scenes whose light is known, for surfaces that are level sets or their meshes: see `transport.analytic`."""
         stage = self.make()
-        if not getattr(stage, "transport", True):
+        if not capabilities(stage).transport:
             raise unittest.SkipTest("the backend says that it is no light transport")
         cases = [case for make in self.cases if applies(case := make(), stage)]
         limit, each = (sidak(3 * n, 5e-4) for n in (len(cases), sum(len(case.expected) for case in cases)))

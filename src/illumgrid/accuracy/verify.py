@@ -14,6 +14,7 @@ from illumgrid.errors import BadInput
 from illumgrid.field.volume import Floats
 from illumgrid.stages import Backend
 from illumgrid.transport.analytic import CASES, Case
+from illumgrid.transport.stages import capabilities
 
 Bools = NDArray[np.bool_]
 
@@ -66,16 +67,8 @@ def line(row: Row) -> str:
 
 
 def contenders() -> dict[str, Backend]:
-    """The backends that work on this machine, by the names of the table; numba with both of its surfaces."""
-    known: dict[str, dict[str, str]] = {f"numba:{surface}": {"surface": surface} for surface in ("levelset", "mesh")}
-    known |= {"embree": {}, "reference": {}}
-    found = {}
-    for title, options in known.items():
-        try:
-            found[title] = registry.backend(title.split(":")[0], **options)
-        except BadInput:
-            continue
-    return found
+    """The backends of light that work on this machine, by the names of the table; numba with both of its surfaces."""
+    return {title: stage for title, stage, can in registry.backends() if can.transport}
 
 
 def _named(names: Iterable[str | Backend]) -> dict[str, Backend]:
@@ -149,7 +142,7 @@ def _measure(case: Case, backend: Backend, paths: int, seed: int) -> tuple[Float
 
 def applies(case: Case, backend: Backend) -> bool:
     """Whether a case can be asked of a backend: on voxels only the trilinear level set itself passes."""
-    return not case.voxels or (backend.geometry != "mesh" and getattr(backend, "surface", "") != "mesh")
+    return not case.voxels or capabilities(backend).surface == "levelset"
 
 
 def judge(

@@ -9,7 +9,7 @@ import inspect
 import os
 import re
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import MISSING, dataclass, fields, is_dataclass
+from dataclasses import MISSING, dataclass, fields, is_dataclass, replace
 from functools import cache
 from importlib.metadata import entry_points, version
 from typing import Any, NamedTuple, cast, get_type_hints
@@ -20,6 +20,7 @@ from illumgrid import stages
 from illumgrid.errors import BadInput, tell
 from illumgrid.registry import options
 from illumgrid.stages import Backend, Interpolator, Sampler
+from illumgrid.transport.stages import Capabilities, capabilities
 
 OWN = (
     "samplers.direct",
@@ -144,8 +145,11 @@ def _fault(kind: str, stage: Any) -> str | None:
         KINDS[kind].call(inspect.signature(method))
     except TypeError:
         return f"{what}.{KINDS[kind].method} takes {inspect.signature(method)}; expected the arguments of a {kind}"
-    if kind == "backend" and getattr(stage, "geometry", None) not in ("mesh", "levelset", "both"):
-        return f"{what}.geometry is {getattr(stage, 'geometry', None)!r}; expected 'mesh', 'levelset' or 'both'"
+    if kind == "backend":
+        try:
+            capabilities(stage)
+        except BadInput as fault:
+            return str(fault)
     kinds = get_type_hints(stage)
     for f in fields(stage):
         if f.default is MISSING or options.expected(kinds[f.name]) is None:
@@ -305,3 +309,19 @@ def backend(name: str, **options: Any) -> Backend:
 def interpolator(name: str, **options: Any) -> Interpolator:
     """Interpolator by name: ``interpolator("nearest")``."""
     return cast(Interpolator, make("interpolator", name, options))
+
+
+def backends() -> Iterator[tuple[str, Backend, Capabilities]]:
+    """Every backend that can run here with its default options, once per surface: "numba:mesh", "embree"."""
+    for found in entries():
+        if found.kind != "backend" or found.missing() is not None:
+            continue
+        try:
+            stage = backend(found.name)
+        except (BadInput, ImportError):  # two packages claim the name, or something is missing after all
+            continue
+        for surface in capabilities(stage).variants:
+            chosen = replace(cast(Any, stage), surface=surface)
+            yield f"{found.name}:{surface}", chosen, capabilities(chosen)
+        if not capabilities(stage).variants:
+            yield found.name, stage, capabilities(stage)

@@ -9,7 +9,8 @@ A package brings stages by hooks, functions marked with `hookimpl`, in a module 
 """
 
 from collections.abc import Iterable, Iterator, Sequence
-from typing import ClassVar, Literal, Protocol, runtime_checkable
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal, Protocol, runtime_checkable
 
 import numpy as np
 import pluggy
@@ -85,6 +86,45 @@ class Backend(Protocol):
             Reflections: 0 is light straight from background and lamps.
         seed : int
         """
+
+
+@dataclass(frozen=True)
+class Capabilities:
+    """What a backend computes, and on which surface.
+
+    Parameters
+    ----------
+    surface : {"levelset", "mesh"}
+        What stands for a level set in its answers.
+    transport : bool
+        Whether the answers are light.
+    variants : tuple of str
+        Surfaces that its option ``surface`` chooses between; empty if it has no such option.
+    """
+
+    surface: Literal["mesh", "levelset"]
+    transport: bool
+    variants: tuple[Literal["levelset", "mesh"], ...]
+
+
+def capabilities(backend: Any) -> Capabilities:
+    """What a backend, or its class, can do: read from ``geometry``, ``transport`` and the option ``surface``.
+
+    Raises
+    ------
+    BadInput
+        If ``geometry`` is missing or unknown.
+    """
+    geometry, option = getattr(backend, "geometry", None), getattr(backend, "surface", None)
+    if geometry not in ("mesh", "levelset", "both"):
+        name = getattr(backend, "__name__", type(backend).__name__)
+        raise BadInput(f"{name}.geometry is {geometry!r}; expected 'mesh', 'levelset' or 'both'")
+    mesh = geometry == "mesh" or (geometry == "both" and option == "mesh")
+    return Capabilities(
+        surface="mesh" if mesh else "levelset",
+        transport=getattr(backend, "transport", True),
+        variants=("levelset", "mesh") if geometry == "both" and option is not None else (),
+    )
 
 
 @runtime_checkable

@@ -12,6 +12,7 @@ from illumgrid.errors import BadInput
 from illumgrid.field.scene import Scene
 from illumgrid.stages import Backend, Interpolator, Sampler
 from illumgrid.transport.samples import Queries
+from illumgrid.transport.tracer import prepare
 
 COUNTS = (8, 32, 128)
 """Level sets that a sampler with the option ``count`` tries."""
@@ -62,17 +63,6 @@ def _stages(kind: str) -> Iterator[Any]:
                 continue
 
 
-def _surfaces(backend: Any) -> Iterator[tuple[Any, str]]:
-    """A backend once for each stand-in for the level sets that it can trace."""
-    if backend.geometry != "both":
-        yield backend, backend.geometry
-    elif hasattr(backend, "surface"):
-        for surface in ("levelset", "mesh"):
-            yield replace(backend, surface=surface), surface
-    else:
-        yield backend, "levelset"
-
-
 def backends(scene: Scene, asked: Queries, budget: float) -> tuple[list[tuple[Any, str, float]], list[str]]:
     """Backends with their surfaces and slowness, warm, and sentences about those that are too slow for the budget.
 
@@ -82,16 +72,16 @@ def backends(scene: Scene, asked: Queries, budget: float) -> tuple[list[tuple[An
     notes = []
     few = asked[: min(64, len(asked))]
     few = few[np.flatnonzero((few.level == few.level[0]).all(axis=1))]  # a mesh is made for each level set
-    for plain in _stages("backend"):
-        for backend, surface in _surfaces(plain):
-            try:
-                for some in (few[:1], few):  # compiled and built in the first
-                    begun = time.perf_counter()
-                    backend.solve(scene, some, paths=range(4), bounces=2, seed=0)
-            except BadInput as reason:
-                notes.append(f"{backend.name} takes no part: {reason}")
-                continue
-            took.append(((time.perf_counter() - begun) * 64 / len(few), backend, surface))
+    for _, backend, can in registry.backends():
+        try:
+            tracer = prepare(backend, scene)
+            for some in (few[:1], few):  # compiled and built in the first
+                begun = time.perf_counter()
+                tracer.solve(some, paths=range(4), bounces=2, seed=0)
+        except BadInput as reason:
+            notes.append(f"{backend.name} takes no part: {reason}")
+            continue
+        took.append(((time.perf_counter() - begun) * 64 / len(few), backend, can.surface))
     found, fastest = [], min((spent for spent, _, _ in took), default=1.0)
     for spent, backend, surface in took:
         if spent <= max(SLOWEST * budget, fastest):
