@@ -43,6 +43,15 @@ def targets(ending):
 
 
 # What is refused; after the bar what is odd but legal.
+READING = {
+    "--spacing": [f"{n}|1|1" for n in (*NUMBERS, "-1", "0")],
+    "--channel": [*NAMES, "1", HUGE],
+    "--time": [*NAMES, "1", HUGE],
+    "--array": [*NAMES, "0", HUGE],
+    "--label": [*WORDS, "7"],
+    "--crop": [*(f"{n}|8|0|8|0|8" for n in (*WORDS, "-1", "7", HUGE)), "0|1|0|8|0|8", "5|2|0|8|0|8"],
+    "--downsample": [*WORDS, "-1", "0", HUGE],
+}
 REFUSED = {
     ("run", "source"): SOURCES,
     ("run", "--output"): ["v.npy", "v.npy/x", "sealed/new", "x" * 300, "", ".", "/", "folder", "dangling", "out"],
@@ -65,6 +74,7 @@ REFUSED = {
     ("run", "--grid"): [*WORDS, "-1", "0", "1", HUGE],
     ("run", "--scene"): NAMES,
     ("run", "--albedo"): [f"{n}|0.5|0.5" for n in (*NUMBERS, "-1", "1.5", HUGE)],
+    **{(command, option): values for command in ("run", "info") for option, values in READING.items()},
     ("run", "--set"): [*NAMES, "=", ".", ".=", "sampler.=1", "sampler.nonsense=1", "nonsense.count=1"],
     ("run", "--error"): [*NUMBERS, "-1", "0", "1", HUGE],
     ("run", "--seconds"): [*NUMBERS, "-1", "0"],

@@ -35,7 +35,7 @@ def bench(
     from illumgrid.cli.run import _input
     from illumgrid.io import store
 
-    given = _input(source, None, limits, None, None)
+    given = _input(source, None, limits, None, None, {})
     folder = output or Path(f"{given.name}-bench")
     store.claim_new(folder)
     with reported_warnings():

@@ -4,6 +4,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from illumgrid.cli.reading import Array, Channel, Crop, Downsample, Label, Spacing, Time, given
 from illumgrid.cli.terminal import Ignore, omitted_light, reported_warnings
 
 if TYPE_CHECKING:
@@ -35,6 +36,13 @@ def info(
     inside: Annotated[
         str | None, typer.Option(help="Which side of the isovalue is solid: above, below. [default: above]")
     ] = None,
+    spacing: Spacing = None,
+    channel: Channel = None,
+    time: Time = None,
+    array: Array = None,
+    label: Label = None,
+    crop: Crop = None,
+    downsample: Downsample = None,
     ignore: Ignore = None,
 ) -> None:
     """Tell what is inside a volume or a finished run, and what of a volume will make trouble."""
@@ -43,16 +51,22 @@ def info(
 
     if inside not in (None, "above", "below"):
         raise BadInput(f"--inside is {inside!r}; expected above or below")
+    reading = given(
+        spacing=spacing, channel=channel, time=time, array=array, label=label, crop=crop, downsample=downsample
+    )
     with reported_warnings(ignore):
         if not store.is_run(source):
-            _told_volume(source, limits, "below" if inside == "below" else "above")
-        elif limits or inside:
-            raise BadInput(f"{source} is a finished run, which has its range and side; leave --range and --inside out")
+            _told_volume(source, limits, "below" if inside == "below" else "above", reading)
+        elif extra := given(range=limits, inside=inside, **reading):
+            options = ", ".join(f"--{option}" for option in extra)
+            raise BadInput(
+                f"{options} came with the finished run {source}; expected a volume file with them; leave them out"
+            )
         else:
             _told_run(source)
 
 
-def _told_volume(source: str, limits: tuple[float, float] | None, inside: "Side") -> None:
+def _told_volume(source: str, limits: tuple[float, float] | None, inside: "Side", reading: dict[str, Any]) -> None:
     from illumgrid.errors import tell
     from illumgrid.field.diagnosis import critical_isovalues, diagnose, plateaus
     from illumgrid.field.lattice import nodes_over
@@ -60,7 +74,7 @@ def _told_volume(source: str, limits: tuple[float, float] | None, inside: "Side"
     from illumgrid.field.volume import finite
     from illumgrid.io.readers import read_volume, volume_name
 
-    volume = finite(read_volume(source), inside)
+    volume = finite(read_volume(source, **reading), inside)
     _told_lattice(volume_name(source), volume)
     low, high, why = suggest_range(volume, inside)
     typer.echo(f"  suggested range  {low:.4g} to {high:.4g}: {why}")

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from illumgrid.cli.reading import Array, Channel, Crop, Downsample, Label, Spacing, Time, given
 from illumgrid.cli.terminal import Ignore, omitted_light, progress_bars, reported_warnings, say
 from illumgrid.errors import BadInput, tell
 
@@ -17,11 +18,6 @@ if TYPE_CHECKING:
     from illumgrid.field.scene import Scene
     from illumgrid.field.volume import Side
     from illumgrid.light import Illumination
-
-
-def _given(**options: Any) -> str:
-    """Names of the options that were given, as typed."""
-    return ", ".join(f"--{name}" for name, value in options.items() if value is not None)
 
 
 @dataclass(frozen=True)
@@ -39,6 +35,7 @@ def _input(
     limits: tuple[float, float] | None,
     inside: str | None,
     albedo: tuple[float, float, float] | None,
+    reading: dict[str, Any],
 ) -> Input:
     """Tell a volume file from a scene file and a built-in scene; nothing is read yet."""
     from illumgrid.field.builtin import SCENES
@@ -47,16 +44,19 @@ def _input(
     name = "nucleus" if source is None else source
     preset = SCENES.get(name) if source is None or not Path(source).exists() else None
     if preset or name.lower().endswith(".toml"):
-        if extra := _given(scene=surroundings, range=limits, inside=inside, albedo=albedo):
+        if extra := given(scene=surroundings, range=limits, inside=inside, albedo=albedo, **reading):
+            options = ", ".join(f"--{option}" for option in extra)
             what, todo = ("built-in scene", "leave") if preset else ("scene file", "write them into the file and leave")
-            raise BadInput(f"{extra} came with the {what} {name!r}; expected a volume file with them: {todo} them out")
+            raise BadInput(
+                f"{options} came with the {what} {name!r}; expected a volume file with them: {todo} them out"
+            )
         return Input(name, partial(_smoothed, preset.make), preset) if preset else _scene_file(name)
     if inside not in (None, "above", "below"):
         raise BadInput(f"--inside is {inside!r}; expected above or below")
     if surroundings not in (None, "sky", "floor", "box"):
         raise BadInput(f"--scene is {surroundings!r}; expected sky, floor or box")
     side: Side = "below" if inside == "below" else "above"
-    make = partial(_volume_scene, name, surroundings or "sky", albedo or (0.8, 0.8, 0.8), limits, side)
+    make = partial(_volume_scene, name, surroundings or "sky", albedo or (0.8, 0.8, 0.8), limits, side, reading)
     return Input(volume_name(name), make)
 
 
@@ -66,14 +66,17 @@ def _scene_file(name: str) -> Input:
     return Input(Path(name).stem, lambda smooth: read_scene(name, smoothing=smooth))
 
 
-def _volume_scene(source: str, surroundings: str, albedo: Any, limits: Any, inside: "Side", smooth: float) -> "Scene":
+def _volume_scene(
+    source: str, surroundings: str, albedo: Any, limits: Any, inside: "Side", reading: dict[str, Any], smooth: float
+) -> "Scene":
     from illumgrid.field.scene import Scene
     from illumgrid.field.volume import finite
     from illumgrid.field.volume import smooth as blur
     from illumgrid.io.readers import read_volume, volume_name
 
     around = {"sky": Scene.sky, "floor": Scene.floor, "box": Scene.box}[surroundings]
-    return around(blur(finite(read_volume(source), inside), smooth), albedo, limits, inside, volume_name(source))
+    volume = finite(read_volume(source, **reading), inside)
+    return around(blur(volume, smooth), albedo, limits, inside, volume_name(source))
 
 
 def _smoothed(make: Callable[[], "Scene"], smooth: float) -> "Scene":
@@ -158,6 +161,13 @@ def run(
         tuple[float, float, float] | None,
         typer.Option(metavar="R G B", help="Share of light that the surface reflects. [default: 0.8 0.8 0.8]"),
     ] = None,
+    spacing: Spacing = None,
+    channel: Channel = None,
+    time_step: Time = None,
+    array: Array = None,
+    label: Label = None,
+    crop: Crop = None,
+    downsample: Downsample = None,
     settings: Annotated[
         list[str] | None, typer.Option("--set", metavar="STAGE.OPTION=VALUE", help="Any option of a stage, repeatable.")
     ] = None,
@@ -190,13 +200,16 @@ def run(
     with reported_warnings(ignore) as sentences:
         names = {"sampler": sampler, "backend": backend, "interpolator": interpolator}
         stages = _stages(names, settings or [], {"backend.threads": threads, "sampler.count": isovalues})
-        given = _input(source, surroundings, limits, inside, albedo)
-        if given.preset and error is None and seconds is None:
-            grid, paths = grid or given.preset.grid, paths or given.preset.paths
-            isovalues = isovalues or given.preset.isovalues
-        folder = output or Path(f"{given.name}-light")
+        reading = given(
+            spacing=spacing, channel=channel, time=time_step, array=array, label=label, crop=crop, downsample=downsample
+        )
+        asked = _input(source, surroundings, limits, inside, albedo, reading)
+        if asked.preset and error is None and seconds is None:
+            grid, paths = grid or asked.preset.grid, paths or asked.preset.paths
+            isovalues = isovalues or asked.preset.isovalues
+        folder = output or Path(f"{asked.name}-light")
         store.claim(folder, overwrite)
-        scene = given.make(smooth or 0.0)
+        scene = asked.make(smooth or 0.0)
         for field in scene.fields:
             shape = " x ".join(map(str, field.volume.shape))
             say(f"{field.name}: {shape} voxels, isovalues {field.range[0]:.4g} to {field.range[1]:.4g}")
@@ -213,7 +226,8 @@ def run(
         _told_help(light, stages)
     recipe = {
         **light.recipe,
-        "input": given.name if source is None else source,
+        "input": asked.name if source is None else source,
+        "reading": reading,
         "smooth": smooth or 0.0,
         "warnings": sentences,
     }

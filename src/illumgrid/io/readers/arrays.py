@@ -92,10 +92,12 @@ def _read_npy(stream: IO[bytes], most: int, wanted: Wanted) -> NDArray[Any]:
 def _three_axes(values: NDArray[Any], wanted: Wanted) -> NDArray[Any]:
     """Of more than three axes: `--time N` takes [N, ...], `--channel N` [..., N]; axes of length 1 are dropped."""
     shape = "x".join(map(str, values.shape))
-    if values.ndim > 3 and wanted.time is not None:
-        values = values[pick(wanted.time, "time", [""] * len(values))]
-    if values.ndim > 3 and wanted.channel is not None:
-        values = values[..., pick(wanted.channel, "channel", [""] * values.shape[-1])]
+    if wanted.time is not None:
+        number = pick(wanted.time, "time", [""] * (len(values) if values.ndim > 3 else 1))
+        values = values[number] if values.ndim > 3 else values
+    if wanted.channel is not None:
+        number = pick(wanted.channel, "channel", [""] * (values.shape[-1] if values.ndim > 3 else 1))
+        values = values[..., number] if values.ndim > 3 else values
     while values.ndim > 3 and 1 in (values.shape[0], values.shape[-1]):
         values = values[0] if values.shape[0] == 1 else values[..., 0]
     if values.ndim > 3:

@@ -32,7 +32,8 @@ def read_scene(path: str | os.PathLike[str], *, smoothing: float = 0.0) -> Scene
     ----------
     path : str or path-like
         UTF-8, at most 1 MB, with these tables: ``[[field]]``, one or more, with `name`, `volume` (what `read_volume`
-        reads, relative to this file) and perhaps `albedo`, `emission`, `range`, `inside`; ``[[quad]]`` with `name`,
+        reads, relative to this file) and perhaps `albedo`, `emission`, `range`, `inside`, and the options of
+        `read_volume` (`spacing`, `channel`, `time`, `array`, `label`, `crop`, `downsample`); ``[[quad]]`` with `name`,
         `corner`, `edge_u`, `edge_v` and perhaps `albedo`, `emission`, `texels`; ``[background]`` with `radiance`. What
         is left out has the default of `Field`, `Material`, `Quad` or `Scene`.
     smoothing : float, optional
@@ -131,6 +132,28 @@ def _numbers(count: int, expected: str, kind: type[int] | type[float] = float, m
 
 _COLOUR = _numbers(3, "three numbers in brackets (red, green, blue)")
 _VECTOR = _numbers(3, "three numbers in brackets (x, y, z in world units)")
+
+
+def _choice(key: str, value: Any) -> int | str:
+    if isinstance(value, bool) or not isinstance(value, int | str):
+        raise BadInput(f"{key} is {_shown(value)}; expected a whole number from 0, or a name in quotes")
+    return value
+
+
+def _whole(key: str, value: Any) -> int:
+    if isinstance(value, bool) or not isinstance(value, int) or abs(value) > 2**31:
+        raise BadInput(f"{key} is {_shown(value)}; expected a whole number")
+    return value
+
+
+_READING: Mapping[str, Take] = {
+    "spacing": _numbers(3, "three positive numbers in brackets (along x, y, z)"),
+    **dict.fromkeys(("channel", "time", "array"), _choice),
+    "label": _whole,
+    "crop": _numbers(6, "six whole numbers in brackets (first and last + 1 along x, y, z)", int, 2**31),
+    "downsample": _whole,
+}
+"""What `read_volume` takes."""
 _MATERIAL = {"albedo": _COLOUR, "emission": _COLOUR}
 _FIELD: Mapping[str, Take] = {
     "name": _text,
@@ -138,6 +161,7 @@ _FIELD: Mapping[str, Take] = {
     **_MATERIAL,
     "range": _numbers(2, "two numbers in brackets (lowest and highest isovalue)", most=1e300),
     "inside": _side,
+    **_READING,
 }
 _QUAD: Mapping[str, Take] = {
     "name": _text,
@@ -209,24 +233,30 @@ def _scene(tables: Table, folder: Path, smoothing: float) -> Scene:
     volumes: dict[str, Volume] = {}  # two fields may be two ranges of one file
     for place, table in fields:  # last, because reading takes longest
         with _place(place):
-            solids.append(Field(**{**table, "volume": _volume(table, folder, smoothing, volumes)}))
+            volume = _volume(table, folder, smoothing, volumes)
+            solids.append(Field(**{**_without(table, _READING), "volume": volume}))
     return Scene(tuple(solids), tuple(walls), radiance)
+
+
+def _without(table: Table, keys: Mapping[str, Any]) -> Table:
+    return {key: value for key, value in table.items() if key not in keys}
 
 
 def _with_material(table: Table) -> Table:
     """The table with `material` in place of `albedo` and `emission`."""
-    rest = {key: value for key, value in table.items() if key not in _MATERIAL}
-    return {**rest, "material": Material(**{key: table[key] for key in _MATERIAL if key in table})}
+    material = Material(**{key: table[key] for key in _MATERIAL if key in table})
+    return {**_without(table, _MATERIAL), "material": material}
 
 
 def _volume(table: Table, folder: Path, smoothing: float, read: dict[str, Volume]) -> Volume:
     """Volume of a field, smoothed; `read` keeps what other fields have read."""
     from illumgrid.io.readers import read_volume
 
-    name = table["volume"]
+    reading = {key: table[key] for key in _READING if key in table}
+    known = f"{table['volume']} {reading}"
     with _place("volume"):
-        if name not in read:
-            read[name] = read_volume(folder / name)
+        if known not in read:
+            read[known] = read_volume(folder / table["volume"], **reading)
         if smoothing == 0:
-            return read[name]
-        return smooth(finite(read[name], table.get("inside", "above")), smoothing)
+            return read[known]
+        return smooth(finite(read[known], table.get("inside", "above")), smoothing)

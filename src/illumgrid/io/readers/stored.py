@@ -63,11 +63,11 @@ def pick(chosen: Choice, option: str, names: Sequence[str]) -> int:
         return 0
     if chosen is None:
         raise BadInput(f"holds {len(names)} {kinds}: {listed}; expected one; choose it with --{option} N ({option}=N)")
-    if isinstance(chosen, str) and chosen in names:
+    if isinstance(chosen, str) and chosen and chosen in names:
         return names.index(chosen)
     if (isinstance(chosen, int) or chosen.isdecimal()) and 0 <= int(chosen) < len(names):
         return int(chosen)
-    raise BadInput(f"--{option} is {chosen}; expected one of its {kinds}: {listed}")
+    raise BadInput(f"--{option} is {str(chosen)[:60]!r}; expected one of its {kinds}: {listed}")
 
 
 def crop(stored: Stored, box: Sequence[int]) -> Stored:
