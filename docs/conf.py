@@ -1,4 +1,4 @@
-"""How the pages are built: ``sphinx-build -W -b html docs docs/_build/html``."""
+"""Sphinx configuration: ``sphinx-build -W -b html docs docs/_build/html`` builds the pages."""
 
 import os
 import subprocess
@@ -26,7 +26,7 @@ myst_enable_extensions = ["dollarmath", "amsmath", "deflist", "colon_fence"]
 myst_heading_anchors = 3
 
 autosummary_generate = True
-autodoc_typehints = "none"  # the numpydoc sections say the types, with shapes and units
+autodoc_typehints = "none"  # the numpydoc sections give the types, with shapes and units
 autodoc_member_order = "bysource"
 numpydoc_show_class_members = False
 
@@ -43,7 +43,7 @@ sphinx_gallery_conf = {
     "capture_repr": (),
 }
 
-live = Path(__file__).parent / "live"  # pages that the gallery writes and the site carries as they are
+live = Path(__file__).parent / "live"  # pages that the gallery writes, copied unchanged into the site
 live.mkdir(exist_ok=True)
 html_extra_path = ["live"]
 

@@ -2,9 +2,9 @@
 A neuron: near or far?
 ======================
 
-Figure 1 of Banks and Beason (2007) shows a neuron twice. Local light says how a surface faces the eye, and nothing
-else: the branches could lie in one plane. Global light comes from somewhere, is held up by what is in its way, and so
-tells what is above what.
+Figure 1 of Banks and Beason (2007) shows a neuron twice. Local light depends only on the orientation of the surface
+towards the viewer: the branches could all lie in one plane. Global light casts shadows, and these show which branch
+lies above which.
 """
 
 from dataclasses import replace
@@ -32,9 +32,9 @@ scene = replace(scene, quads=(floor, lamp), background=np.full(3, 0.35))
 light = ig.run(scene, grid=128, paths=32, bounces=2, isovalues=4)
 
 # %%
-# **What to look for:** on the left nothing says how high a branch runs above the floor, or which of two that cross is
-# nearer. On the right each throws a shadow: the farther the shadow lies from its branch and the softer it is, the
-# higher the branch; where both meet, it touches the floor. Branches in a bundle dim each other.
+# **What to look for:** the left picture does not show how high a branch runs above the floor, or which of two crossing
+# branches is nearer. In the right one each branch casts a shadow: the farther the shadow lies from its branch and the
+# softer it is, the higher the branch; where both meet, the branch touches the floor. Bundled branches dim each other.
 
 level = limits[0] + (limits[1] - limits[0]) / 6
 figure, axes = plt.subplots(1, 2, figsize=(10, 4.6), facecolor="0.235", layout="constrained")

@@ -2,8 +2,8 @@
 A brain: how deep is a fold?
 ============================
 
-Figure 2 of Banks and Beason (2007): the folds of a brain. Local light draws every fold with the same dark line, deep or
-shallow. Global light reaches the bottom of a wide valley and not that of a narrow one.
+Figure 2 of Banks and Beason (2007): the folds of a brain. Local light draws every fold, deep or shallow, as the same
+dark line. Global light reaches the bottom of a wide valley and not that of a narrow one.
 """
 
 import matplotlib.pyplot as plt
@@ -17,9 +17,9 @@ volume, limits, source = brain()
 light = ig.run(ig.Scene.sky(volume, albedo=(0.8, 0.66, 0.6), range=limits), paths=24)
 
 # %%
-# **What to look for:** the cleft between the halves, and the one above the temple, are the deepest. On the left they
-# are lines like all others; on the right they are dark valleys, and the gap below, where the brain faces itself, is
-# darkest of all.
+# **What to look for:** the clefts between the hemispheres and above the temple are the deepest. In the left picture
+# they are lines like all others; in the right one they are dark valleys, and the gap below, where the brain faces
+# itself, is darkest.
 
 figure, axes = plt.subplots(1, 2, figsize=(10, 4.4), facecolor="0.235", layout="constrained")
 for ax, local in zip(axes, (True, False)):

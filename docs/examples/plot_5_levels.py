@@ -2,12 +2,13 @@
 Levels and samples: from isosurfaces to a grid
 ==============================================
 
-Figure 5 of Banks and Beason (2007) shows how a grid is made: light is asked for at points strewn over some isosurfaces
-(the sampler ``uniform``), and the nodes of the grid take it from the points nearest to them. Few isosurfaces leave gaps
-between them, whose nodes take light from a surface that is not theirs; many close the gaps. The sampler ``direct`` asks
-at the nodes themselves, each on the isosurface through it.
+Figure 5 of Banks and Beason (2007) shows how a grid is computed: light is sampled at points scattered over some
+isosurfaces (the sampler ``uniform``), and each node of the grid takes the light of the nearest point. Few isosurfaces
+leave gaps, whose nodes take light from another isosurface than their own; many isosurfaces close the gaps. The sampler
+``direct`` asks for light at the nodes themselves, each on the isosurface through it.
 
-The scene is the paper's: one blob in a box, red wall left, green wall right, a luminaire at the bottom.
+The scene is that of the paper: one blob in a box, with a red wall on the left, a green one on the right, and a
+luminaire at the bottom.
 """
 
 import warnings
@@ -24,14 +25,14 @@ volume = spread(random.uniform(-0.55, 0.55, (14, 3)), voxels=48, sigma=0.17)
 scene = ig.Scene.box(volume, range=(0.25, 0.85))
 
 # %%
-# The isosurfaces that three settings ask at, in the slice through the middle of the field, and the picture that comes
-# of it, all at one isovalue that none of them asked at.
+# Top: the isosurfaces that three settings sample, in the slice through the middle of the field. Bottom: the resulting
+# pictures, all at one isovalue that none of them sampled.
 #
-# **What to look for:** with three levels the surface is blotched: its nodes have the light of isosurfaces that lie
-# elsewhere and face elsewhere. With twelve the blotches shrink. ``direct`` has none of them: what is left is the noise
-# of sixteen paths.
+# **What to look for:** with three levels the surface is blotched, because its nodes have the light of isosurfaces with
+# other positions and orientations. With twelve levels the blotches shrink. ``direct`` has none; only the noise of 64
+# paths remains.
 
-warnings.simplefilter("ignore", ig.IllumgridWarning)  # nodes without a sample in reach: here that is the subject
+warnings.simplefilter("ignore", ig.IllumgridWarning)  # nodes without a sample within reach: the subject of this figure
 samplers = {
     "3 levels": ig.sampler("uniform", count=3),
     "12 levels": ig.sampler("uniform", count=12),

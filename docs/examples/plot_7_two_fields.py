@@ -2,12 +2,12 @@
 Two fields, one sweep
 =====================
 
-Figure 7 of Banks and Beason (2007): the densities of protons and neutrons in a nucleus, lit together. Each field has a
-grid of its own, and light passes between their isosurfaces; one slider moves both. The walls have textures that know
-the place of the slider too.
+Figure 7 of Banks and Beason (2007): the densities of protons and neutrons in a nucleus, lit together. Each field has
+its own grid, and light is reflected between their isosurfaces; one slider moves both. The light textures of the walls
+depend on the slider, too.
 
-Light a scene once, then draw any of its isosurfaces without asking for light again: the pictures below differ in
-nothing but the isovalue. ``illumgrid preview nucleus-light --sweep 24 nucleus.webp`` makes a film of it.
+The scene is lit once; any of its isosurfaces can then be drawn without computing light again. The pictures below differ
+only in the isovalue. ``illumgrid preview nucleus-light --sweep 24 nucleus.webp`` makes a film of the sweep.
 """
 
 import matplotlib.pyplot as plt
@@ -20,8 +20,8 @@ scene = nucleus()
 light = ig.run(scene, grid=28, paths=48, isovalues=5)
 
 # %%
-# **What to look for:** the shadows on the walls, and the red and green that the walls throw back, follow the surfaces
-# from left to right. Blue surfaces tint the orange ones next to them.
+# **What to look for:** the shadows on the walls, and the red and green light that the walls reflect, follow the
+# surfaces from left to right. Blue surfaces tint the orange ones next to them.
 
 camera = fit_camera(scene, widest_row(scene), 4 / 3)
 figure, axes = plt.subplots(1, 3, figsize=(10.5, 3.0), facecolor="0.235", layout="constrained")
@@ -32,7 +32,7 @@ for ax, row in zip(axes, scene.levels([0.05, 0.45, 0.95])):
 plt.show()
 
 # %%
-# Under a lamp at the camera alone, which surface is nearer cannot be told where their outlines do not overlap.
+# With a lamp at the camera only, the picture does not show which surface is nearer unless their outlines overlap.
 
 figure, ax = plt.subplots(figsize=(3.9, 3.0), facecolor="0.235", layout="constrained")
 ax.imshow(render(light, width=480, height=360, local=True))

@@ -2,9 +2,9 @@
 Sweep it yourself
 =================
 
-Figures 7 and 8 of Banks and Beason (2007), to be moved by hand: the light was computed when these pages were built, and
-each isosurface is drawn by your graphics card. The page is one file of about a megabyte, as ``illumgrid view DIR
---export page.html`` writes it.
+Figures 7 and 8 of Banks and Beason (2007), interactively: the light was computed when these pages were built, and your
+graphics card draws each isosurface. Each page is one file of about a megabyte, as ``illumgrid view DIR --export
+page.html`` writes it.
 """
 
 from pathlib import Path
@@ -15,7 +15,7 @@ from illumgrid.show.viewer import page
 
 light = ig.run(nucleus(), grid=28, paths=96, isovalues=5)
 
-folder = Path("../live")  # what these pages carry along; elsewhere the file lands beside you
+folder = Path("../live")  # copied with these pages; outside the docs, the file goes to the current folder
 file = (folder if folder.is_dir() else Path()) / "nucleus-live.html"
 file.write_text(page(light), encoding="utf-8")
 
@@ -28,8 +28,8 @@ file.write_text(page(light), encoding="utf-8")
 #     <iframe src="../nucleus-live.html" title="Two fields, one sweep: interactive page" loading="lazy"
 #       style="width: 100%; height: 560px; border: 1px solid #8886; border-radius: 6px"></iframe>
 #
-# **Looks at display time** (Figure 8). The same stored light under a translucent surface, and a glossy one if you
-# choose it: effects of display, drawn over light that was computed for matte, opaque surfaces.
+# **Display effects** (Figure 8). The same stored light on a translucent surface, or on a glossy one if you select it.
+# These effects are drawn over light that was computed for matte, opaque surfaces.
 #
 # .. raw:: html
 #
