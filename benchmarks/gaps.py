@@ -19,6 +19,7 @@ from illumgrid import GridSpec, Scene, interpolator, isosurface, read_volume
 from illumgrid import backend as backend_named
 from illumgrid.field.scene import level_table
 from illumgrid.field.volume import index_to_world, interpolate, smooth
+from illumgrid.grid import Nodes
 from illumgrid.samplers.adaptive import adaptive_rows
 from illumgrid.stages import on_level_sets
 from illumgrid.transport.samples import join_queries
@@ -82,7 +83,7 @@ def errors(scene, levels, nodes, points, paths):
         samples = backend.solve(scene, queries, paths=range(paths), bounces=TRUTH["bounces"], seed=0)
         told = []
         for name in ("nearest", "splat", "rbf"):
-            miss = interpolator(name).fill(samples, spec, 0).lookup(asked.point) - truth
+            miss = interpolator(name).fill(samples, Nodes(spec, scene.fields[0])).lookup(asked.point) - truth
             told.append(f"{name} {np.sqrt(np.mean(miss**2)) / truth.mean():.3f} / "
                         f"{np.median(np.abs(miss)) / truth.mean():.4f}")  # fmt: skip
         print(f"  {sampler:24} {len(rows)} levels, {len(queries)} queries:  " + "   ".join(told), flush=True)

@@ -16,6 +16,7 @@ import time
 import numpy as np
 
 from illumgrid import GridSpec, Queries, Samples, interpolator
+from illumgrid.grid import Nodes
 
 SPHERES, NOISE = 24, 0.02
 
@@ -54,11 +55,11 @@ def truth_points(nodes):
 def measure(name, count, nodes, noise, pipe):
     """Fill once, in this process, and send the figures."""
     stage = interpolator(name)
-    stage.fill(on_spheres(2000, 12, noise), GridSpec((12, 12, 12)), 0)
+    stage.fill(on_spheres(2000, 12, noise), Nodes(GridSpec((12, 12, 12)), None))  # no stage here reads the field
     samples, spec = on_spheres(count, nodes, noise), GridSpec((nodes,) * 3)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     wall, busy = time.perf_counter(), time.process_time()
-    grid = stage.fill(samples, spec, 0)
+    grid = stage.fill(samples, Nodes(spec, None))
     wall, busy = time.perf_counter() - wall, time.process_time() - busy
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     at, place = truth_points(nodes)

@@ -9,7 +9,6 @@ import SimpleITK as sitk  # noqa: N813
 from illumgrid.field.levelset import isosurface
 from illumgrid.field.volume import index_to_world, interpolate, world_to_index
 from illumgrid.io import exports
-from illumgrid.io.exports.arrays import certainty
 from illumgrid.io.readers import read_volume
 from lights import lopsided_light
 from shapes import DIRECTIONS, refused
@@ -26,7 +25,7 @@ def expected(light, world, number=0):
         "irradiance": light.grid(field.name).lookup(world),
         "field": h.astype(np.float32),
         "color": light.color(world, field=field.name),
-        **dict(zip(("error", "support"), certainty(light.grids[number], world))),
+        **dict(zip(("error", "support"), light.grids[number].certainty(world))),
     }
 
 
@@ -165,14 +164,14 @@ def test_certainty_is_that_of_the_nodes_that_a_lookup_mixes():
     light = lopsided_light(np.eye(3))
     grid = light.grids[0]
     spec = grid.spec
-    on_nodes = certainty(grid, spec.nodes())
+    on_nodes = grid.certainty(spec.nodes())
     assert np.array_equal(on_nodes[0], grid.error.ravel()) and np.array_equal(on_nodes[1], grid.support.ravel())
     hole, half = np.array([2, 1, 2]), np.array([0.5, 0, 0])
-    error, support = certainty(grid, index_to_world(spec, [hole - half, hole - 2 * half, hole - 3 * half]))
+    error, support = grid.certainty(index_to_world(spec, [hole - half, hole - 2 * half, hole - 3 * half]))
     assert np.isinf(error[0]) and support[0] == 0  # between a node and a hole
     assert error[1] == grid.error[1, 1, 2] and support[1] == grid.support[1, 1, 2]  # on the node beside it
     assert np.isclose(error[2], grid.error[:2, 1, 2].mean()) and support[2] == grid.support[:2, 1, 2].min()
-    outside = certainty(grid, index_to_world(spec, [[-3, 0, 0], [99, 99, 99]]))
+    outside = grid.certainty(index_to_world(spec, [[-3, 0, 0], [99, 99, 99]]))
     assert np.array_equal(outside[0], [grid.error[0, 0, 0], grid.error[-1, -1, -1]])
 
 

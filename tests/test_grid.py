@@ -1,11 +1,25 @@
 """The grid: where its nodes lie, what is read between them, and how holes are filled."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
+from illumgrid.field.scene import Scene
 from illumgrid.field.volume import Volume, index_to_world
-from illumgrid.grid import GridSpec, IlluminationGrid, fill_holes, read_lattice
-from shapes import DIRECTIONS, MIRRORED, refused
+from illumgrid.grid import (
+    GREY,
+    RGB,
+    Channels,
+    GridSpec,
+    IlluminationGrid,
+    WallTexture,
+    channels_of,
+    fill_holes,
+    illumination,
+    read_lattice,
+)
+from shapes import DIRECTIONS, MIRRORED, ball, refused
 
 UNEVEN = np.array([0.5, 1.25, 3.0])
 
@@ -162,3 +176,70 @@ def test_all_or_no_support_leaves_the_values(support):
     spec = GridSpec((2, 3, 4))
     values = np.random.default_rng(0).random((2, 3, 4, 3)).astype(np.float32)
     assert np.array_equal(fill_holes(spec.spacing, values, np.full((2, 3, 4), support, np.float32)), values)
+
+
+# Channels
+
+
+def test_grey_light_is_stored_once_and_read_as_rgb():
+    random = np.random.default_rng(0)
+    light, ones = random.random((3, 4, 5, 1)).astype(np.float32), np.ones((3, 4, 5))
+    spec = GridSpec((3, 4, 5), (1, 2, 3), UNEVEN, MIRRORED)
+    grey, rgb = IlluminationGrid(spec, light, ones, ones), IlluminationGrid(spec, np.repeat(light, 3, 3), ones, ones)
+    assert grey.channels == GREY and rgb.channels == RGB
+    assert grey.light.nbytes * 3 == rgb.light.nbytes and np.shares_memory(grey.values, grey.light)
+    assert np.shares_memory(rgb.values, rgb.light)
+    assert np.array_equal(grey.values, rgb.values) and not grey.values.flags.writeable
+    points = random.random((50, 3)) * 9
+    for name in ("lookup", "uncertainty"):
+        assert np.array_equal(getattr(grey, name)(points), getattr(rgb, name)(points))
+    assert np.array_equal(grey.bar, rgb.bar) and grey.resolution == rgb.resolution and grey.mean == rgb.mean
+    assert grey.lookup(points).flags.writeable
+    assert dataclasses.replace(grey, support=2 * ones).channels == GREY
+
+
+def test_channels_are_mixed_to_what_is_shown():
+    """Two lamps, one red and one white: light is linear, so their sum is what both together give."""
+    two = Channels(("lamp", "sky"), ((0.5, 0.0, 0.0), (2.0, 2.0, 2.0)))
+    light, ones = np.random.default_rng(0).random((3, 4, 5, 2)), np.ones((3, 4, 5))
+    grid = IlluminationGrid(GridSpec((3, 4, 5)), light, ones, ones, two)
+    np.testing.assert_allclose(grid.values[..., 0], 0.5 * light[..., 0] + 2 * light[..., 1], rtol=1e-6)
+    np.testing.assert_allclose(grid.values[..., 2], 2 * light[..., 1], rtol=1e-6)
+    points = np.random.default_rng(1).random((50, 3)) * 3
+    shown = IlluminationGrid(grid.spec, grid.values, ones, ones)
+    np.testing.assert_allclose(grid.lookup(points), shown.lookup(points), rtol=1e-5)
+    np.testing.assert_allclose(grid.bar, shown.bar, rtol=1e-5)
+    wall = WallTexture(light.transpose(2, 1, 0, 3), ones.T, two)
+    assert wall.lookup(0.5, 0.5, 0.5).shape == (1, 3) and wall.values.shape == (5, 4, 3, 3)
+    refused(lambda: IlluminationGrid(grid.spec, light, ones, ones), "(3, 4, 5, 2)", "1 (grey) or 3 (RGB)")
+    refused(lambda: IlluminationGrid(grid.spec, light, ones, ones, RGB), "3: R, G, B")
+
+
+def test_a_scene_is_grey_unless_something_in_it_has_a_colour():
+    volume = ball(6)
+    assert channels_of(Scene.sky(volume, (0.5, 0.5, 0.5))) == GREY
+    assert channels_of(Scene.sky(volume, (0.5, 0.5, 0.6))) == RGB
+    assert channels_of(Scene.box(volume, (0.5, 0.5, 0.5))) == RGB  # its walls are red and green
+
+
+# What a grid is asked
+
+
+def test_a_point_is_covered_if_every_node_of_its_cell_has_light_of_its_own():
+    support = np.ones((4, 4, 4))
+    support[1, 1, 1] = 0
+    grid = IlluminationGrid(GridSpec((4, 4, 4)), np.ones((4, 4, 4, 3)), np.ones((4, 4, 4)), support)
+    points = [[1.5, 1.5, 1.5], [2.5, 1.5, 1.5], [2, 1, 1], [1, 1, 1], [0.5, 0.5, 2.0], [0.5, 1.0, 1.0], [9, 9, 9]]
+    assert grid.covered(points).tolist() == [False, True, True, False, True, False, True]
+
+
+def test_blocks_are_the_nodes_of_the_dense_arrays_in_their_order(monkeypatch):
+    monkeypatch.setattr(illumination, "_BLOCK", 17)
+    for channels in (1, 3):
+        light = np.random.default_rng(0).random((3, 4, 5, channels))
+        support = np.arange(60.0).reshape(3, 4, 5)
+        grid = IlluminationGrid(GridSpec((3, 4, 5)), light, 0.1 * support, support)
+        nodes, *arrays = zip(*grid.blocks())
+        assert [n.stop for n in nodes] == [17, 34, 51, 60]
+        for parts, whole in zip(arrays, grid.dense()):
+            assert np.array_equal(np.concatenate(parts), whole.reshape(60, *whole.shape[3:]))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from illumgrid.field.volume import Volume
-from illumgrid.grid import GridSpec
+from illumgrid.grid import GridSpec, Nodes
 from illumgrid.interpolators import neighbours, spline
 from illumgrid.interpolators.nearest import Nearest
 from illumgrid.interpolators.rbf import Rbf
@@ -41,6 +41,7 @@ def wave(points):
 
 
 SPEC = GridSpec((9, 9, 9))
+FIELD = sky(ball(6), (0.3, 0.9)).fields[0]
 
 
 # What theory says
@@ -53,7 +54,7 @@ def test_a_constant_is_reproduced_with_any_normals_and_levels(stage, n):
     spec = GridSpec((6, 7, 5), (1, 2, 3), UNEVEN, MIRRORED)
     normal = random.normal(size=(n, 3))
     samples = answers(cloud(n, spec), 3.0, level=random.integers(0, 5, n), normal=normal)
-    grid = stage.fill(samples, spec, 0)
+    grid = stage.fill(samples, Nodes(spec, FIELD))
     assert (grid.support > 0).any()
     np.testing.assert_allclose(grid.values, 3.0, rtol=1e-6)
 
@@ -64,7 +65,8 @@ def test_it_converges_as_samples_grow(stage):
     for n in (400, 3200, 25600):
         points = cloud(n, SPEC)
         inner = (np.abs(SPEC.nodes() - 4) < 4).all(axis=1)
-        miss = stage.fill(answers(points, wave(points)), SPEC, 0).values.reshape(-1, 3)[:, 0] - wave(SPEC.nodes())
+        grid = stage.fill(answers(points, wave(points)), Nodes(SPEC, FIELD))
+        miss = grid.values.reshape(-1, 3)[:, 0] - wave(SPEC.nodes())
         rmse.append(np.sqrt(np.mean(miss[inner] ** 2)))
     # The samples come twice as close each time: first order would be 4 in all.
     assert rmse[2] < rmse[1] < rmse[0] and rmse[2] < rmse[0] / (3.5 if stage.name == "splat" else 10)
@@ -74,7 +76,7 @@ def test_rbf_reproduces_what_is_linear_among_its_samples():
     spec = GridSpec((7, 8, 6), (1e5, -2e5, 3e5), UNEVEN, MIRRORED)
     points = cloud(4000, spec)
     values = 5 + (points - spec.origin) @ [0.1, -0.2, 0.15]
-    grid = Rbf().fill(answers(points, values), spec, 0)
+    grid = Rbf().fill(answers(points, values), Nodes(spec, FIELD))
     node = spec.nodes() - spec.origin
     truth = (5 + node @ [0.1, -0.2, 0.15]).reshape(spec.shape)
     np.testing.assert_allclose(grid.values[1:-1, 1:-1, 1:-1, 0], truth[1:-1, 1:-1, 1:-1], rtol=2e-6)
@@ -92,7 +94,7 @@ def test_rbf_is_the_identity_on_direct_queries(origin):
     at_node = np.flatnonzero((np.abs(queries.point - spec.nodes(queries.id.astype(int))) < 1e-6).all(axis=1))
     at_node = at_node[queries.normal[at_node].any(axis=1)]
     assert len(at_node) > 200
-    grid = Rbf().fill(samples, spec, 0)
+    grid = Rbf().fill(samples, Nodes(spec, FIELD))
     node = queries.id[at_node].astype(int)
     np.testing.assert_allclose(grid.values.reshape(-1, 3)[node], mean[at_node], atol=1e-6)
     np.testing.assert_allclose(grid.error.ravel()[node], samples.error[at_node], rtol=1e-5)
@@ -122,10 +124,10 @@ def test_the_error_of_a_node_is_that_of_independent_samples(stage):
     points = cloud(700, SPEC)
     stderr = random.uniform(0.1, 2.0, 700)
     runs = np.array([
-        stage.fill(answers(points, 50 + stderr * random.normal(size=700), stderr), SPEC, 0).values[..., 0]
+        stage.fill(answers(points, 50 + stderr * random.normal(size=700), stderr), Nodes(SPEC, FIELD)).values[..., 0]
         for _ in range(200)
     ])  # fmt: skip
-    error = stage.fill(answers(points, 50.0, stderr), SPEC, 0).error
+    error = stage.fill(answers(points, 50.0, stderr), Nodes(SPEC, FIELD)).error
     # The squared ratio of spread and error has mean 1; rbf's is smaller where it is held within its samples.
     ratio = np.mean(runs.var(axis=0, ddof=1) / error**2)
     assert ratio < 1.05 and ratio > (0.95 if stage.name == "splat" else 0.7)
@@ -133,14 +135,14 @@ def test_the_error_of_a_node_is_that_of_independent_samples(stage):
 
 @BOTH
 def test_support_is_how_many_samples_a_node_is_worth(stage):
-    grid = stage.fill(answers(cloud(700, SPEC), 1.0, stderr=0.3), SPEC, 0)
+    grid = stage.fill(answers(cloud(700, SPEC), 1.0, stderr=0.3), Nodes(SPEC, FIELD))
     assert (grid.support > 0).all() and grid.support.max() <= 16
     np.testing.assert_allclose(grid.error, 0.3 / np.sqrt(grid.support), rtol=1e-5)
 
 
 @BOTH
 def test_one_path_supports_a_node_though_its_error_is_unknown(stage):
-    grid = stage.fill(answers([[4, 4, 4], [4, 4, 5]], 2.0, paths=1), SPEC, 0)
+    grid = stage.fill(answers([[4, 4, 4], [4, 4, 5]], 2.0, paths=1), Nodes(SPEC, FIELD))
     near = grid.support > 0
     assert near.any() and np.isinf(grid.error[near]).all() and (grid.values == 2).all()
 
@@ -150,7 +152,7 @@ def test_samples_at_one_place_are_merged_by_their_paths(stage):
     points = np.full((500, 3), 4.0) + np.random.default_rng(0).uniform(-1e-9, 1e-9, (500, 3))
     paths = np.where(np.arange(500) < 100, 30, 10)
     mean = np.where(np.arange(500) < 100, 1.0, 8.0)
-    grid = stage.fill(answers(points, mean, stderr=0.5, paths=paths), SPEC, 0)
+    grid = stage.fill(answers(points, mean, stderr=0.5, paths=paths), Nodes(SPEC, FIELD))
     np.testing.assert_allclose(grid.values, (3000 * 1 + 4000 * 8) / 7000, rtol=1e-5)
     expected = 0.5 * np.sqrt(100 * 30**2 + 400 * 10**2) / 7000
     np.testing.assert_allclose(grid.error[4, 4, 4], expected, rtol=1e-5)
@@ -162,7 +164,7 @@ def test_samples_at_one_place_are_merged_by_their_paths(stage):
 @BOTH
 def test_nodes_beyond_a_cells_diagonal_are_holes_with_the_light_of_the_nearest_node(stage):
     spec = GridSpec((12, 3, 3))
-    grid = stage.fill(answers([[0, 1, 1], [11, 1, 1]], [1.0, 4.0]), spec, 0)
+    grid = stage.fill(answers([[0, 1, 1], [11, 1, 1]], [1.0, 4.0]), Nodes(spec, FIELD))
     supported = np.linalg.norm(spec.nodes() - [0, 1, 1], axis=1) <= 3**0.5 + 1e-5
     supported |= np.linalg.norm(spec.nodes() - [11, 1, 1], axis=1) <= 3**0.5 + 1e-5
     assert np.array_equal(grid.support.ravel() > 0, supported)
@@ -188,7 +190,7 @@ def test_between_two_level_sets_light_is_interpolated_and_beyond_them_it_is_not_
         np.concatenate([low, high]), np.repeat([1.0, 7.0], [len(low), len(high)]),
         level=np.repeat([0.7, 0.2], [len(low), len(high)]), normal=(0, 0, 1),
     )  # fmt: skip
-    grid = stage.fill(up, spec, 0)
+    grid = stage.fill(up, Nodes(spec, FIELD))
     reached = (grid.support > 0)[3:-3, 3:-3]
     # Samples reach a cell's diagonal, 1.7; between the sheets, 6 apart, every node is reached.
     assert reached[:, :, 3:12].all() and not reached[:, :, :2].any() and not reached[:, :, 13:].any()
@@ -201,7 +203,7 @@ def test_between_two_level_sets_light_is_interpolated_and_beyond_them_it_is_not_
 def test_nearest_leaves_the_middle_of_a_wide_gap_a_hole():
     spec = GridSpec((13, 13, 15))
     points = np.concatenate([sheet(4.0, spec, 0), sheet(10.0, spec, 1)])
-    grid = Nearest().fill(answers(points, 1.0, level=points[:, 2], normal=(0, 0, 1)), spec, 0)
+    grid = Nearest().fill(answers(points, 1.0, level=points[:, 2], normal=(0, 0, 1)), Nodes(spec, FIELD))
     assert not grid.support[:, :, 7].any()
 
 
@@ -209,13 +211,13 @@ def test_nearest_leaves_the_middle_of_a_wide_gap_a_hole():
 @pytest.mark.parametrize("count", [0, 3])
 def test_no_answer_at_all_is_a_grid_of_holes_without_nan(stage, count):
     spec = GridSpec((3, 4, 5))
-    grid = stage.fill(answers(np.ones((count, 3)), 0.0, paths=0), spec, 0)
+    grid = stage.fill(answers(np.ones((count, 3)), 0.0, paths=0), Nodes(spec, FIELD))
     assert not grid.values.any() and not grid.support.any() and np.isinf(grid.error).all()
 
 
 @BOTH
 def test_answers_without_paths_are_passed_over(stage):
-    grid = stage.fill(answers([[1, 1, 1], [1, 1, 1.4]], [9.0, 3.0], paths=[0, 4]), GridSpec((3, 3, 3)), 0)
+    grid = stage.fill(answers([[1, 1, 1], [1, 1, 1.4]], [9.0, 3.0], paths=[0, 4]), Nodes(GridSpec((3, 3, 3)), FIELD))
     assert (grid.values[1, 1, 1] == 3).all()
 
 
@@ -235,7 +237,7 @@ def two_faces(apart, facing, per=4):
 
 def worst_mixture(stage, spec, samples):
     """Largest share of the other side's light at the nodes closer to one sheet than to the other."""
-    light = stage.fill(samples, spec, 0).values[..., 0]
+    light = stage.fill(samples, Nodes(spec, FIELD)).values[..., 0]
     side = np.where(np.arange(9) > 4, 1.0, 0.0)[None, None]
     return np.abs(light - side)[:, :, [3, 5]].max()
 
@@ -253,7 +255,7 @@ def test_two_faces_one_cell_apart_do_not_mix(stage, facing):
 def test_light_stays_within_the_range_of_its_samples(stage):
     points = cloud(3000, SPEC)
     light = (np.random.default_rng(4).random(3000) > 0.5).astype(float)  # two sheets without a side
-    values = stage.fill(answers(points, light), SPEC, 0).values
+    values = stage.fill(answers(points, light), Nodes(SPEC, FIELD)).values
     assert values.min() >= 0 and values.max() <= 1
 
 
@@ -285,9 +287,9 @@ def test_rbf_lays_a_ridge_where_its_weights_would_amplify_and_nowhere_else():
 @BOTH
 def test_slabs_of_nodes_do_not_show(stage, monkeypatch):
     samples = answers(cloud(300, SPEC), np.random.default_rng(0).random(300), stderr=0.1)
-    whole = stage.fill(samples, SPEC, 0)
+    whole = stage.fill(samples, Nodes(SPEC, FIELD))
     monkeypatch.setattr(neighbours, "_SLAB", 17)
-    parts = stage.fill(samples, SPEC, 0)
+    parts = stage.fill(samples, Nodes(SPEC, FIELD))
     for name in ("values", "error", "support"):
         assert np.array_equal(getattr(whole, name), getattr(parts, name))
 
@@ -297,8 +299,8 @@ def test_slabs_of_nodes_do_not_show(stage, monkeypatch):
 def test_the_unit_of_length_does_not_matter(stage, scale):
     points = cloud(300, SPEC)
     light = np.random.default_rng(0).random(300)
-    one = stage.fill(answers(points, light), SPEC, 0)
-    other = stage.fill(answers(scale * points, light), GridSpec(SPEC.shape, spacing=np.full(3, scale)), 0)
+    one = stage.fill(answers(points, light), Nodes(SPEC, FIELD))
+    other = stage.fill(answers(scale * points, light), Nodes(GridSpec(SPEC.shape, spacing=np.full(3, scale)), FIELD))
     np.testing.assert_allclose(one.values, other.values, atol=1e-6)
 
 
@@ -312,7 +314,7 @@ def test_they_are_interpolators_that_refuse_nonsense():
 @pytest.mark.plain
 def test_the_kernel_of_rbf_as_plain_python():
     points = cloud(60, GridSpec((3, 3, 3)))
-    grid = Rbf(8).fill(answers(points, points @ [1.0, 2.0, 3.0]), GridSpec((3, 3, 3)), 0)
+    grid = Rbf(8).fill(answers(points, points @ [1.0, 2.0, 3.0]), Nodes(GridSpec((3, 3, 3)), FIELD))
     assert grid.values[1, 1, 1, 0] == pytest.approx(6, abs=0.02)
     flat = points * [1, 1, 1e-3]
-    assert np.isfinite(Rbf(8).fill(answers(flat, 1.0), GridSpec((3, 3, 3)), 0).values).all()
+    assert np.isfinite(Rbf(8).fill(answers(flat, 1.0), Nodes(GridSpec((3, 3, 3)), FIELD)).values).all()

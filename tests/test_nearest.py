@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from illumgrid.field.volume import Volume
-from illumgrid.grid import GridSpec
+from illumgrid.grid import GridSpec, Nodes
 from illumgrid.interpolators import nearest
 from illumgrid.interpolators.nearest import Nearest
 from illumgrid.samplers.direct import Direct
@@ -13,6 +13,7 @@ from illumgrid.transport.samples import Queries, Samples, join_queries
 from shapes import MIRRORED, ball, sky
 
 UNEVEN = np.array([0.5, 1.25, 3.0])
+FIELD = sky(ball(6), (0.3, 0.9)).fields[0]
 
 
 def answers(points, mean, paths=None, m2=None):
@@ -36,7 +37,7 @@ def test_nearest_is_the_identity_on_direct_queries(origin):
     random = np.random.default_rng(0)
     mean, m2 = random.random((2, len(queries), 3)).astype(np.float32)
     samples = Samples(queries, mean, m2, np.full(len(queries), 8, np.int32))
-    grid = Nearest().fill(samples, spec, 0)
+    grid = Nearest().fill(samples, Nodes(spec, FIELD))
     node = queries.id[at_node].astype(int)
     assert np.array_equal(grid.values.reshape(-1, 3)[node], mean[at_node])
     assert np.array_equal(grid.error.ravel()[node], samples.error[at_node])
@@ -48,7 +49,7 @@ def test_every_node_takes_the_nearest_sample_in_the_world():
     random = np.random.default_rng(1)
     points = spec.nodes()[random.integers(0, 120, 300)] + random.normal(scale=0.5, size=(300, 3))
     mean = random.random((300, 3)).astype(np.float32)
-    grid = Nearest().fill(answers(points, mean), spec, 0)
+    grid = Nearest().fill(answers(points, mean), Nodes(spec, FIELD))
     apart = np.linalg.norm(spec.nodes()[:, None] - points[None], axis=2)
     near = apart.min(axis=1) <= np.linalg.norm(UNEVEN)
     assert near.sum() > 80
@@ -58,7 +59,7 @@ def test_every_node_takes_the_nearest_sample_in_the_world():
 
 def test_nodes_beyond_a_cells_diagonal_are_holes_with_the_light_of_the_nearest_node():
     spec = GridSpec((12, 3, 3))
-    grid = Nearest().fill(answers([[0, 1, 1], [11, 1, 1]], [[1, 2, 3], [4, 5, 6]]), spec, 0)
+    grid = Nearest().fill(answers([[0, 1, 1], [11, 1, 1]], [[1, 2, 3], [4, 5, 6]]), Nodes(spec, FIELD))
     supported = np.linalg.norm(spec.nodes() - [0, 1, 1], axis=1) <= 3**0.5
     supported |= np.linalg.norm(spec.nodes() - [11, 1, 1], axis=1) <= 3**0.5
     assert np.array_equal(grid.support.ravel() > 0, supported)
@@ -68,35 +69,35 @@ def test_nodes_beyond_a_cells_diagonal_are_holes_with_the_light_of_the_nearest_n
 
 def test_answers_without_paths_are_passed_over():
     spec = GridSpec((3, 3, 3))
-    grid = Nearest().fill(answers([[1, 1, 1], [1, 1, 1.4]], [[0, 0, 0], [1, 2, 3]], paths=[0, 4]), spec, 0)
+    grid = Nearest().fill(answers([[1, 1, 1], [1, 1, 1.4]], [[0, 0, 0], [1, 2, 3]], paths=[0, 4]), Nodes(spec, FIELD))
     assert (grid.values[1, 1, 1] == [1, 2, 3]).all()
     assert grid.support[1, 1, 1] == 1
 
 
 def test_one_path_supports_a_node_though_its_error_is_unknown():
-    grid = Nearest().fill(answers([[1, 1, 1]], 2.0, paths=[1]), GridSpec((3, 3, 3)), 0)
+    grid = Nearest().fill(answers([[1, 1, 1]], 2.0, paths=[1]), Nodes(GridSpec((3, 3, 3)), FIELD))
     assert (grid.support == 1).all() and np.isinf(grid.error).all() and (grid.values == 2).all()
 
 
 @pytest.mark.parametrize("count", [0, 3])
 def test_no_answer_at_all_is_a_grid_of_holes_without_nan(count):
     spec = GridSpec((3, 4, 5))
-    grid = Nearest().fill(answers(np.ones((count, 3)), 0.0, paths=np.zeros(count)), spec, 0)
+    grid = Nearest().fill(answers(np.ones((count, 3)), 0.0, paths=np.zeros(count)), Nodes(spec, FIELD))
     assert not grid.values.any() and not grid.support.any() and np.isinf(grid.error).all()
     assert np.isfinite(grid.lookup(spec.nodes())).all()
 
 
 def test_many_samples_at_one_place_are_no_trouble():
-    grid = Nearest().fill(answers(np.ones((500, 3)), np.full((500, 3), 7.0)), GridSpec((3, 3, 3)), 0)
+    grid = Nearest().fill(answers(np.ones((500, 3)), np.full((500, 3), 7.0)), Nodes(GridSpec((3, 3, 3)), FIELD))
     assert (grid.values == 7).all()
 
 
 def test_slabs_of_nodes_do_not_show(monkeypatch):
     spec, random = GridSpec((6, 7, 5)), np.random.default_rng(0)
     samples = answers(random.random((40, 3)) * [5, 6, 4], random.random((40, 3)))
-    whole = Nearest().fill(samples, spec, 0)
+    whole = Nearest().fill(samples, Nodes(spec, FIELD))
     monkeypatch.setattr(nearest, "_SLAB", 17)
-    parts = Nearest().fill(samples, spec, 0)
+    parts = Nearest().fill(samples, Nodes(spec, FIELD))
     for name in ("values", "error", "support"):
         assert np.array_equal(getattr(whole, name), getattr(parts, name))
 

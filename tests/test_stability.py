@@ -16,6 +16,7 @@ from illumgrid import registry
 from illumgrid.errors import IllumgridWarning
 from illumgrid.field.scene import Field, Material, Scene, box_around
 from illumgrid.field.volume import Volume
+from illumgrid.grid import Nodes
 from illumgrid.transport.samples import join_queries
 from shapes import ball, refused, sampled
 
@@ -215,5 +216,5 @@ def test_coincident_samples_count_once():
     twice = join_queries([asked, replace(asked, id=asked.id + np.uint64(1 << 20))])
     answer = ig.backend("numba").solve(scene, twice, paths=range(8), bounces=1, seed=0)
     for name in INTERPOLATORS:
-        grid = ig.interpolator(name).fill(answer, spec, 0)
+        grid = ig.interpolator(name).fill(answer, Nodes(spec, scene.fields[0]))
         assert np.isfinite(grid.values).all() and (grid.values[grid.support > 0] > 0).any()

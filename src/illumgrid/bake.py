@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 from illumgrid.errors import BadInput
 from illumgrid.field.scene import Levels, Quad, Scene
 from illumgrid.field.volume import interpolate, world_to_index
-from illumgrid.grid import GridSpec, IlluminationGrid, WallTexture, fill_holes
+from illumgrid.grid import GridSpec, IlluminationGrid, Nodes, WallTexture, fill_holes
 from illumgrid.samplers.direct import Direct, reachable
 from illumgrid.stages import Backend, Interpolator, Sampler
 from illumgrid.transport.samples import Queries, Samples, combine, join_queries, join_samples
+from illumgrid.transport.stages import fill_nodes
 from illumgrid.transport.tracer import Tracer, prepare
 
 Progress = Callable[[str, int, int], None]
@@ -324,7 +325,7 @@ def bake(
     for number, spec in enumerate(specs):
         samples = _of_field(scene, answers, number)
         answers = [a for a in answers if (a.queries.target != number).any()]  # a large run is held once, not twice
-        grids.append(interpolator.fill(samples, spec, number))
+        grids.append(fill_nodes(interpolator, samples, Nodes(spec, scene.fields[number], number)))
         del samples
         progress("grid", number + 1, len(specs))
     walls = [_wall_texture(len(levels.table), quad, answer) for quad, answer in zip(scene.quads, answers)]

@@ -15,12 +15,12 @@ import numpy as np
 from illumgrid.accuracy.verify import applies, judge, line, sidak
 from illumgrid.field.scene import Field, Material, Quad, Scene
 from illumgrid.field.volume import Floats, Volume, interpolate, outward_normals, world_to_index
-from illumgrid.grid import GridSpec, IlluminationGrid
+from illumgrid.grid import GridSpec, IlluminationGrid, Nodes
 from illumgrid.registry.options import expected, options
 from illumgrid.stages import on_level_sets
 from illumgrid.transport.analytic import CASES, on_quad
 from illumgrid.transport.samples import Queries, Samples, combine, join_queries
-from illumgrid.transport.stages import capabilities
+from illumgrid.transport.stages import capabilities, fill_nodes
 
 __all__ = ["BackendTests", "InterpolatorTests", "SamplerTests"]
 
@@ -270,7 +270,7 @@ class InterpolatorTests(_StageTests):
     def fill(self, light: Any = 1.0, m2: Any = 1.0, paths: Any = 4, rows: Any = slice(None), **density: int) -> Any:
         """Grid, samples and spec: answers on level sets of field 0, whose light may be a function of the points."""
         samples, spec = _answers(light, m2, paths, **density)
-        grid = self.make().fill(samples[rows], spec, 0)
+        grid = fill_nodes(self.make(), samples[rows], Nodes(spec, _scene().fields[0]))
         self.check(grid, spec)
         return grid
 
@@ -346,7 +346,8 @@ class InterpolatorTests(_StageTests):
         """Their light lies between."""
         samples, spec = _answers(np.arange(len(_answers(1.0)[0])) % 2 + 1.0)
         point = np.repeat(samples.queries.point[:4], len(samples) // 4 + 1, axis=0)[: len(samples)]
-        grid = self.make().fill(replace(samples, queries=replace(samples.queries, point=point)), spec, 0)
+        moved = replace(samples, queries=replace(samples.queries, point=point))
+        grid = fill_nodes(self.make(), moved, Nodes(spec, _scene().fields[0]))
         self.check(grid, spec)
         values = grid.values[grid.support > 0]
         assert len(values) and values.min() > 1 - 1e-3 and values.max() < 2 + 1e-3, "coincident samples overshoot"
@@ -361,8 +362,8 @@ class InterpolatorTests(_StageTests):
 def _between(spec: GridSpec) -> Any:
     """Nodes (n,) between the first and the last level set of field 0 of the scene."""
     field = _scene().fields[0]
-    value = interpolate(field.volume, world_to_index(field.volume, spec.nodes()))
-    return (value > field.range[0]) & (value < field.range[1])
+    (every,) = Nodes(spec, field).blocks()
+    return (every.level > field.range[0]) & (every.level < field.range[1])
 
 
 def _answers(light: Any, m2: Any = 1.0, paths: Any = 4, levels: int = 8, points: int = 160) -> tuple[Samples, GridSpec]:

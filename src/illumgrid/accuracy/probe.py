@@ -19,7 +19,7 @@ from illumgrid.errors import BadInput
 from illumgrid.field.scene import Scene
 from illumgrid.field.volume import Floats, world_to_index
 from illumgrid.field.volume import corners as corners_of
-from illumgrid.grid import GridSpec
+from illumgrid.grid import GridSpec, Nodes
 from illumgrid.interpolators.nearest import Nearest
 from illumgrid.samplers.direct import at_nodes, reachable
 from illumgrid.stages import Backend
@@ -235,6 +235,8 @@ def timed(scene: Scene, backend: Backend, grid: int, paths: int, bounces: int, s
         per_path.append((time.perf_counter() - begun) / (len(chosen) * paths))
         # Few nodes would cost as much as many; and the least of three, for in so short a time a stall counts for many.
         asking = timeit.repeat(partial(at_nodes, scene, number, spec, many), number=1, repeat=3)
-        filling = timeit.repeat(partial(Nearest().fill, answer, small, number), number=1, repeat=3)
+        filling = timeit.repeat(
+            partial(Nearest().fill, answer, Nodes(small, scene.fields[number], number)), number=1, repeat=3
+        )
         per_node.append(min(asking) / len(many) + min(filling) / int(np.prod(small.shape)))
     return Pace(float(np.mean(per_node)), float(np.mean(per_path)))

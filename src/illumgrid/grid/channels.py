@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from illumgrid.errors import BadInput
 from illumgrid.field.scene import Scene
@@ -16,7 +16,7 @@ class Channels:
     Parameters
     ----------
     names : tuple of str
-        C names.
+        C names, those of the channels in an EXR file.
     mix : tuple of (float, float, float)
         What each channel adds to red, green and blue, C rows.
     """
@@ -28,19 +28,16 @@ class Channels:
         return len(self.names)
 
     def rgb(self, light: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Linear RGB (..., 3) of light (..., C); a read-only view where no arithmetic is needed."""
+        """Linear RGB (..., 3) of light (..., C): a view where no arithmetic is needed."""
         if self == RGB:
-            shown = light.view()
-        elif self == GREY:
-            shown = np.broadcast_to(light, (*light.shape[:-1], 3))
-        else:
-            shown = light @ np.array(self.mix, dtype=np.float32)
-        shown.flags.writeable = False
-        return shown
+            return light
+        if self == GREY:
+            return np.broadcast_to(light, (*light.shape[:-1], 3))
+        return light @ np.array(self.mix, dtype=np.float32)
 
 
-RGB = Channels(("red", "green", "blue"), ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)))
-GREY = Channels(("grey",), ((1.0, 1.0, 1.0),))
+RGB = Channels(("R", "G", "B"), ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)))
+GREY = Channels(("Y",), ((1.0, 1.0, 1.0),))
 
 
 def channels_of(scene: Scene) -> Channels:
@@ -50,8 +47,22 @@ def channels_of(scene: Scene) -> Channels:
     return GREY if all((color == color[0]).all() for color in colors) else RGB
 
 
-def channels_for(count: int) -> Channels:
-    """The channels that an array of so many has when nobody names them: 1 grey, 3 RGB."""
-    if count not in (1, 3):
-        raise BadInput(f"light of {count} channels came without their names; expected 1 (grey) or 3 (RGB)")
-    return GREY if count == 1 else RGB
+def kept(light: ArrayLike, channels: Channels | None = None) -> tuple[NDArray[np.float32], Channels]:
+    """Light as it is stored, (..., C) contiguous read-only float32, and its channels: by default 1 is grey, 3 is RGB.
+
+    Raises
+    ------
+    BadInput
+        If the last axis is not as long as there are channels.
+    """
+    array = np.asarray(light, dtype=np.float32)
+    count = array.shape[-1] if array.ndim else 0
+    if channels == GREY and count == 3 and array.strides[-1] == 0:
+        array, count = array[..., :1], 1  # the RGB view of grey light, as dataclasses.replace hands it on
+    expected = {1: GREY, 3: RGB} if channels is None else {len(channels): channels}
+    if count not in expected:
+        named = "1 (grey) or 3 (RGB)" if channels is None else f"{len(channels)}: {', '.join(channels.names)}"
+        raise BadInput(f"light came with shape {array.shape}; expected as many channels along the last axis as {named}")
+    stored = np.ascontiguousarray(array).view()
+    stored.flags.writeable = False
+    return stored, expected[count]

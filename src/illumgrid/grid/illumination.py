@@ -1,15 +1,29 @@
 """The illumination grid: light at the nodes of a lattice, with its error bar and its support."""
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, field
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from illumgrid.errors import BadInput
 from illumgrid.field.lattice import GridSpec
-from illumgrid.field.volume import Floats
+from illumgrid.field.volume import Floats, corners, world_to_index
+from illumgrid.grid.channels import GREY, Channels, kept
 from illumgrid.grid.lookup import read_lattice
+
+_BLOCK = 1 << 18  # nodes
+
+
+class Block(NamedTuple):
+    """Some nodes of a grid, one after the other, and what they hold."""
+
+    nodes: slice  # of the flat C-order numbers
+    values: NDArray[np.float32]  # (m, 3)
+    error: NDArray[np.float32]  # (m,)
+    support: NDArray[np.float32]  # (m,)
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,37 +33,93 @@ class IlluminationGrid:
     Parameters
     ----------
     spec : GridSpec
-    values : (nx, ny, nz, 3) float32
-        Irradiance, linear RGB. A node without support holds the value of the nearest supported one.
+    values : (nx, ny, nz, C) array_like
+        Irradiance in C channels; kept as `light`. The attribute `values` is its linear RGB, (nx, ny, nz, 3) float32,
+        read-only. A node without support holds the value of the nearest supported one.
     error : (nx, ny, nz) float32
         Standard error of the node, root mean square over RGB; infinite without support.
     support : (nx, ny, nz) float32
         Number of samples that the node rests upon; 0 marks a hole.
+    channels : Channels, optional
+        By default grey for one channel, RGB for three.
+
+    Attributes
+    ----------
+    light : (nx, ny, nz, C) float32
+        What is stored: one channel for grey light, whose `values` cost no memory.
     """
 
     spec: GridSpec
     values: NDArray[np.float32]
     error: NDArray[np.float32]
     support: NDArray[np.float32]
+    channels: Channels = None  # type: ignore[assignment]
+    light: NDArray[np.float32] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         shape = tuple(self.spec.shape)
-        for name, expected in (("values", (*shape, 3)), ("error", shape), ("support", shape)):
-            array = np.ascontiguousarray(getattr(self, name), dtype=np.float32)
-            if array.shape != expected:
-                raise BadInput(f"the {name} of a grid have shape {array.shape}; expected {expected}")
-            object.__setattr__(self, name, array)
+        if np.shape(self.values)[:-1] != shape:
+            expected = f"{(*shape, 3)} (RGB), {(*shape, 1)} (grey) or as many channels as are named"
+            raise BadInput(f"the values of a grid have shape {np.shape(self.values)}; expected {expected}")
+        light, channels = kept(self.values, self.channels)
+        arrays = {name: np.ascontiguousarray(getattr(self, name), dtype=np.float32) for name in ("error", "support")}
+        for name, array in arrays.items():
+            if array.shape != shape:
+                raise BadInput(f"the {name} of a grid has shape {array.shape}; expected {shape}")
+        values = channels.rgb(light).view()
+        values.flags.writeable = False
+        for name, value in (arrays | {"light": light, "channels": channels, "values": values}).items():
+            object.__setattr__(self, name, value)
 
     def lookup(self, points: ArrayLike) -> NDArray[np.float32]:
         """Irradiance (n, 3) at world points (n, 3), trilinear between nodes; beyond the border, that of the border.
 
         Never NaN: coordinates that are not finite read the border.
         """
-        return read_lattice(self.spec, self.values, points)
+        return np.ascontiguousarray(self.channels.rgb(read_lattice(self.spec, self.light, points)))
+
+    def covered(self, points: ArrayLike) -> NDArray[np.bool_]:
+        """Whether (n,) every node that `lookup` mixes at world points (n, 3) has light of its own."""
+        hole = (self.support == 0)[..., None].astype(np.float32)
+        return np.asarray(read_lattice(self.spec, hole, points)[:, 0] == 0)
+
+    def certainty(self, points: ArrayLike) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Error and support (n,) of the up to eight nodes that `lookup` mixes at world points (n, 3).
+
+        The error is their weighted mean, which holds however the nodes' errors are correlated, and infinite where one
+        has none; the support is the smallest.
+        """
+        index = world_to_index(self.spec, points)
+        error, support = np.zeros(len(index), np.float32), np.full(len(index), np.inf, np.float32)
+        for corner, share in corners(self.spec, index):
+            node, weight = tuple(corner.T), share.astype(np.float32)
+            mixed = weight > 0
+            error[mixed] += weight[mixed] * self.error[node][mixed]
+            support[mixed] = np.minimum(support, self.support[node])[mixed]
+        return error, support
+
+    def blocks(self) -> Iterator[Block]:
+        """Yield all nodes, some at a time, in C order."""
+        light = self.light.reshape(-1, len(self.channels))
+        error, support = self.error.reshape(-1), self.support.reshape(-1)
+        for first in range(0, len(light), _BLOCK):
+            nodes = slice(first, min(first + _BLOCK, len(light)))
+            yield Block(nodes, self.channels.rgb(light[nodes]), error[nodes], support[nodes])
+
+    def dense(self) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+        """Values (nx, ny, nz, 3), error (nx, ny, nz) and support (nx, ny, nz) of all nodes as arrays."""
+        return self.values, self.error, self.support
+
+    @cached_property
+    def mean(self) -> float:
+        """Mean irradiance over RGB of the nodes that have light of their own; 0 if none has."""
+        lit = self.support > 0
+        return float(self.values[lit].mean()) if lit.any() else 0.0
 
     def _bend(self, axis: int, step: int) -> Floats:
         """Mean square over RGB of second differences along an axis, `step` nodes apart, less the noise in them."""
-        light, error = (np.moveaxis(a, axis, 0) for a in (self.values, self.error))
+        shown = self.light if self.channels == GREY else self.values
+        light, error = (np.moveaxis(a, axis, 0) for a in (shown, self.error))
         after, here, before = slice(2 * step, None), slice(step, -step), slice(None, -2 * step)
         square = np.square(light[after] - 2 * light[here] + light[before], dtype=float).mean(axis=-1)
         noise = np.square(error, dtype=float)  # infinite at holes

@@ -13,7 +13,9 @@ def read_lattice(spec: Lattice, values: NDArray[np.float32], points: ArrayLike) 
     world = np.ascontiguousarray(points, dtype=float).reshape(-1, 3)
     result = np.zeros((len(world), values.shape[3]), dtype=np.float32)
     place = (np.ascontiguousarray(x, dtype=float) for x in (spec.origin, spec.direction, spec.spacing))
-    read(np.ascontiguousarray(values, np.float32), *place, ON_A_VOXEL, world, result)
+    fixed = np.ascontiguousarray(values, np.float32).view()
+    fixed.flags.writeable = False  # always: else Numba compiles again, for another type
+    read(fixed, *place, ON_A_VOXEL, world, result)
     return result
 
 

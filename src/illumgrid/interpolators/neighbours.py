@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from illumgrid.field.volume import Floats, world_to_index
-from illumgrid.grid import GridSpec, IlluminationGrid, fill_holes
+from illumgrid.grid import GridSpec, IlluminationGrid, Nodes
 from illumgrid.transport.samples import Samples
 
 _SLAB = 1 << 16  # nodes asked at once: bounds the memory of a search
@@ -45,7 +45,7 @@ class Sites:
     normal : (n, 3) float64
     sheet : (n,) int64
         0 or 1: neighbouring isovalues of the run differ in it.
-    mean, variance : (n, 3), (n,) float64
+    mean, variance : (n, C), (n,) float64
     paths : (n,) float64
     """
 
@@ -57,9 +57,9 @@ class Sites:
     paths: Floats
 
 
-def sites(samples: Samples, spec: GridSpec, field: int) -> Sites:
+def sites(samples: Samples, nodes: Nodes) -> Sites:
     """Answers that are no holes; those at one place are merged, each weighted by its paths."""
-    good = samples[samples.paths > 0]
+    spec, good = nodes.spec, samples[samples.paths > 0]
     point = good.queries.point - spec.origin
     place = np.round(point / (_ONE_PLACE * spec.spacing.min())).astype(np.int64)
     order = np.lexsort(place.T)
@@ -72,24 +72,24 @@ def sites(samples: Samples, spec: GridSpec, field: int) -> Sites:
     paths = good.paths.astype(float)
     total = np.asarray(np.bincount(group, paths, count), float)
     share = paths / total[group]
-    mean: Floats = np.stack([np.bincount(group, share * good.mean[:, rgb], count) for rgb in range(3)], axis=1)
+    mean: Floats = np.stack([np.bincount(group, share * light, count) for light in good.mean.T], axis=1)
     variance = np.asarray(np.bincount(group, np.square(share * good.error), count), float)
-    levels = np.unique(good.queries.level[:, field])
-    sheet = np.searchsorted(levels, good.queries.level[first, field]) % 2
+    levels = np.unique(good.queries.level[:, nodes.number])
+    sheet = np.searchsorted(levels, good.queries.level[first, nodes.number]) % 2
     return Sites(point[first], good.queries.normal[first], sheet, mean, variance, total)
 
 
 class Neighbours(NamedTuple):
     """Sites around nodes in reach: m nodes, k neighbours each, in no order."""
 
-    node: NDArray[np.int64]  # (m,) flat numbers
+    node: NDArray[np.integer]  # (m,) flat numbers
     point: Floats  # (m, 3) from the grid's origin
     site: NDArray[np.int64]  # (m, k)
     distance: Floats  # (m, k); infinite: none
     between: NDArray[np.bool_]  # (m,) in front of the nearest site of one sheet, behind that of the other
 
 
-def neighbours(places: Sites, spec: GridSpec, count: int) -> Iterator[Neighbours]:
+def neighbours(places: Sites, nodes: Nodes, count: int) -> Iterator[Neighbours]:
     """Up to `count` neighbours of each node in reach: half of each sheet, so that a near one does not hide the other.
 
     Sites that face away from the nearest one belong to another surface, the back of a slab or the wall across a cleft,
@@ -101,12 +101,10 @@ def neighbours(places: Sites, spec: GridSpec, count: int) -> Iterator[Neighbours
     members = [m for sheet in (0, 1) if len(m := np.flatnonzero(places.sheet == sheet))]
     trees = [KDTree(places.point[m]) for m in members]
     each = -(-count // len(members)) if members else count
-    near = diagonal(spec)
-    world = places.point + spec.origin
-    candidates = np.flatnonzero(near_samples(spec, world, BETWEEN * near))
-    for begin in range(0, len(candidates), _SLAB):
-        node = candidates[begin : begin + _SLAB]
-        point = spec.nodes(node) - spec.origin
+    spec, near = nodes.spec, diagonal(nodes.spec)
+    candidates = np.flatnonzero(near_samples(spec, places.point + spec.origin, BETWEEN * near))
+    for block in nodes.blocks(candidates, _SLAB):
+        node, point = block.flat, block.point - spec.origin
         distance, site = np.full((len(node), len(trees), each), np.inf), np.zeros((len(node), len(trees), each), int)
         for number, (member, tree) in enumerate(zip(members, trees)):
             asked = range(1, min(each, len(member)) + 1)
@@ -129,11 +127,7 @@ def neighbours(places: Sites, spec: GridSpec, count: int) -> Iterator[Neighbours
 
 
 def filled(
-    samples: Samples,
-    spec: GridSpec,
-    field: int,
-    count: int,
-    weigh: Callable[[Sites, Neighbours], tuple[Floats, Floats]],
+    samples: Samples, nodes: Nodes, count: int, weigh: Callable[[Sites, Neighbours], tuple[Floats, Floats]]
 ) -> IlluminationGrid:
     """Grid whose nodes are weighted sums of neighbours.
 
@@ -142,21 +136,16 @@ def filled(
     count : int
         Neighbours of a node.
     weigh : callable
-        Weights (m, k) that add up to 1, 0 for a missing neighbour, and values (m, 3).
+        Weights (m, k) that add up to 1, 0 for a missing neighbour, and values (m, C).
     """
-    size = int(np.prod(spec.shape))
-    values, error = np.zeros((size, 3), np.float32), np.full(size, np.inf, np.float32)
-    support = np.zeros(size, np.float32)
-    places = sites(samples, spec, field)
-    for around in neighbours(places, spec, count):
-        weight, value = weigh(places, around)
-        values[around.node] = value
+    light = np.zeros((len(nodes), samples.mean.shape[1]), np.float32)
+    error, support = np.full(len(nodes), np.inf, np.float32), np.zeros(len(nodes), np.float32)
+    places = sites(samples, nodes)
+    for around in neighbours(places, nodes, count):
+        weight, light[around.node] = weigh(places, around)
         # As of independent samples. Where one has no error of its own (a single path), the node has none either.
         spread = np.where(weight != 0, places.variance[around.site], 0.0)
         square = np.square(weight)
         error[around.node] = np.sqrt((square * spread).sum(axis=1))
         support[around.node] = 1 / square.sum(axis=1)
-    shape = tuple(spec.shape)
-    support = support.reshape(shape)
-    values = fill_holes(spec.spacing, values.reshape(*shape, 3), support)
-    return IlluminationGrid(spec, values, error.reshape(shape), support)
+    return nodes.grid(light, error, support)

@@ -8,7 +8,7 @@ import numpy as np
 
 from illumgrid.errors import BadInput
 from illumgrid.field.volume import Floats
-from illumgrid.grid import GridSpec, IlluminationGrid
+from illumgrid.grid import IlluminationGrid, Nodes
 from illumgrid.interpolators.neighbours import Neighbours, Sites, filled
 from illumgrid.stages import Interpolator, hookimpl
 from illumgrid.transport.samples import Samples
@@ -17,7 +17,7 @@ from illumgrid.transport.samples import Samples
 def _spline_values(places: Sites, around: Neighbours) -> tuple[Floats, Floats]:
     from illumgrid.interpolators.spline import AMPLIFIES, weigh
 
-    weight, value = np.zeros(around.site.shape), np.zeros((len(around.node), 3))
+    weight, value = np.zeros(around.site.shape), np.zeros((len(around.node), places.mean.shape[1]))
     steps = np.zeros(len(around.node), np.int64)
 
     def chunk(rows: slice) -> None:
@@ -26,7 +26,7 @@ def _spline_values(places: Sites, around: Neighbours) -> tuple[Floats, Floats]:
             weight[rows], value[rows], steps[rows],
         )  # fmt: skip
 
-    chunk(slice(0, 0))  # compiles here, where Ctrl-C is heard, and once
+    chunk(slice(0, 0))  # compiles once, in the main thread, which Ctrl-C interrupts
     size = 1 << 12
     with ThreadPoolExecutor() as pool:
         list(pool.map(chunk, (slice(i, i + size) for i in range(0, len(around.node), size))))
@@ -57,9 +57,9 @@ class Rbf:
         if self.neighbours < 1:
             raise BadInput(f"rbf.neighbours is {self.neighbours}; expected at least 1 sample")
 
-    def fill(self, samples: Samples, spec: GridSpec, field: int) -> IlluminationGrid:
+    def fill(self, samples: Samples, nodes: Nodes) -> IlluminationGrid:
         """Fill every node: see `illumgrid.stages.Interpolator`."""
-        return filled(samples, spec, field, self.neighbours, _spline_values)
+        return filled(samples, nodes, self.neighbours, _spline_values)
 
 
 @hookimpl

@@ -7,7 +7,7 @@ import numpy as np
 
 from illumgrid.errors import BadInput
 from illumgrid.field.volume import Floats
-from illumgrid.grid import GridSpec, IlluminationGrid
+from illumgrid.grid import IlluminationGrid, Nodes
 from illumgrid.interpolators.neighbours import Neighbours, Sites, filled
 from illumgrid.stages import Interpolator, hookimpl
 from illumgrid.transport.samples import Samples
@@ -62,9 +62,9 @@ class Splat:
         if self.neighbours < 1:
             raise BadInput(f"splat.neighbours is {self.neighbours}; expected at least 1 sample")
 
-    def fill(self, samples: Samples, spec: GridSpec, field: int) -> IlluminationGrid:
+    def fill(self, samples: Samples, nodes: Nodes) -> IlluminationGrid:
         """Fill every node: see `illumgrid.stages.Interpolator`."""
-        return filled(samples, spec, field, self.neighbours, _kernel_means)
+        return filled(samples, nodes, self.neighbours, _kernel_means)
 
 
 @hookimpl

@@ -59,7 +59,7 @@ def solve_weights(x, ridge, tail, matrix, right, weight):
 
 @jit
 def weigh(node, site, distance, point, mean, amplifies, weight, value, steps):
-    """Weights (m, k), values (m, 3) and steps of the ridge (m,) for nodes (m, 3) with sites (m, k) around them."""
+    """Weights (m, k), values (m, C) and steps of the ridge (m,) for nodes (m, 3) with sites (m, k) around them."""
     m, k = site.shape
     x, own, used = np.zeros((k, 3)), np.zeros(k), np.zeros(k, np.int64)
     matrix, right = np.zeros((k, k)), np.zeros((k, 2))
@@ -75,8 +75,8 @@ def weigh(node, site, distance, point, mean, amplifies, weight, value, steps):
                 n += 1
         if n == 1 or distance[number, used[nearest]] <= 1e-9 * radius:  # the node is a sample
             weight[number, used[nearest]] = 1.0
-            for rgb in range(3):
-                value[number, rgb] = mean[site[number, used[nearest]], rgb]
+            for c in range(mean.shape[1]):
+                value[number, c] = mean[site[number, used[nearest]], c]
             continue
         for i in range(n):
             for axis in range(3):
@@ -97,10 +97,10 @@ def weigh(node, site, distance, point, mean, amplifies, weight, value, steps):
         for i in range(n):
             weight[number, used[i]] = own[i]
         # Between sheets of different light a spline overshoots: it stays within the range of its neighbours.
-        for rgb in range(3):
+        for c in range(mean.shape[1]):
             low, high, total = np.inf, -np.inf, 0.0
             for i in range(n):
-                light = mean[site[number, used[i]], rgb]
+                light = mean[site[number, used[i]], c]
                 low, high = min(low, light), max(high, light)
                 total += own[i] * light
-            value[number, rgb] = min(max(total, low), high)
+            value[number, c] = min(max(total, low), high)

@@ -241,7 +241,8 @@ def _rebuild(record: Record, parts: dict[str, dict[str, Image]]) -> Stored:
     for about in record["scene"]["fields"]:
         where, light = record["grids"][about["name"]], parts.pop(f"light/{about['name']}")
         spec = GridSpec(_shape(where), *(where[k] for k in PLACE))
-        grids.append(IlluminationGrid(spec, *(_array(light.pop(c), spec.shape) for c in ("RGB", "error", "support"))))
+        values, error, support = (_array(light.pop(c), spec.shape) for c in ("RGB", "error", "support"))
+        grids.append(IlluminationGrid(spec, values, error, support))
         values = _array(parts.pop(f"field/{about['name']}")["Y"], _shape(about))
         volume, material = Volume(values, *(about[k] for k in PLACE)), Material(about["albedo"], about["emission"])
         fields.append(Field(about["name"], volume, material, about["range"], about["inside"]))

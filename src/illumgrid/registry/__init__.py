@@ -56,12 +56,19 @@ class Kind(NamedTuple):
     call: Callable[[inspect.Signature], inspect.BoundArguments]
 
 
+def _filled(signature: inspect.Signature) -> inspect.BoundArguments:
+    try:
+        return signature.bind(0, "samples", "nodes")
+    except TypeError:  # as plugins were written before there were Nodes
+        return signature.bind(0, "samples", "spec", "field")
+
+
 KINDS = {
     "sampler": Kind("register_samplers", "queries", lambda s: s.bind(0, "scene", "specs", "seed")),
     "backend": Kind(
         "register_backends", "solve", lambda s: s.bind(0, "scene", "queries", paths=range(1), bounces=0, seed=0)
     ),
-    "interpolator": Kind("register_interpolators", "fill", lambda s: s.bind(0, "samples", "spec", "field")),
+    "interpolator": Kind("register_interpolators", "fill", _filled),
 }
 
 

@@ -8,7 +8,8 @@ A package brings stages by hooks, functions marked with `hookimpl`, in a module 
 ``illumgrid`` names.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+import inspect
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal, Protocol, runtime_checkable
 
@@ -19,7 +20,7 @@ from numpy.typing import ArrayLike
 from illumgrid.errors import BadInput
 from illumgrid.field.levelset import isosurface
 from illumgrid.field.scene import Scene
-from illumgrid.grid import GridSpec, IlluminationGrid
+from illumgrid.grid import GridSpec, IlluminationGrid, Nodes
 from illumgrid.transport.samples import Queries, Samples
 
 __all__ = [
@@ -27,6 +28,7 @@ __all__ = [
     "GridSpec",
     "IlluminationGrid",
     "Interpolator",
+    "Nodes",
     "Queries",
     "Sampler",
     "Samples",
@@ -133,16 +135,26 @@ class Interpolator(Protocol):
 
     name: ClassVar[str]
 
-    def fill(self, samples: Samples, spec: GridSpec, field: int) -> IlluminationGrid:
+    def fill(self, samples: Samples, nodes: Nodes) -> IlluminationGrid:
         """Fill every node from the samples of one field.
 
         Parameters
         ----------
         samples : Samples
-            All of them on level sets of field number `field`; holes (paths 0) among them.
-        spec : GridSpec
-        field : int
+            All of them on level sets of the nodes' field; holes (paths 0) among them.
+        nodes : Nodes
+            The lattice and the field; by blocks, the point, normal and level of every node.
         """
+
+
+def fill_nodes(interpolator: Interpolator, samples: Samples, nodes: Nodes) -> IlluminationGrid:
+    """Fill nodes by an interpolator; one that has the former signature, ``fill(samples, spec, field)``, gets those."""
+    try:
+        inspect.signature(interpolator.fill).bind("samples", "spec", "field")
+    except TypeError:
+        return interpolator.fill(samples, nodes)
+    former: Callable[..., IlluminationGrid] = interpolator.fill
+    return former(samples, nodes.spec, nodes.number)
 
 
 @_hookspec

@@ -15,9 +15,10 @@ from illumgrid.accuracy.truth import Truth, errors, look_up
 from illumgrid.errors import BadInput
 from illumgrid.field.scene import Scene
 from illumgrid.field.volume import Floats
-from illumgrid.grid import GridSpec, IlluminationGrid, read_lattice
+from illumgrid.grid import GridSpec, IlluminationGrid, Nodes
 from illumgrid.stages import Interpolator
 from illumgrid.transport.samples import Queries, Samples, combine, join_samples
+from illumgrid.transport.stages import fill_nodes
 
 PATHS = (8, 32, 128, 512, 2048)
 """Of the rungs of a lane: `run`'s default is one of them."""
@@ -125,7 +126,7 @@ class Run:
         grids = []
         for number, spec in enumerate(self.specs):
             own = [a for a in self.answers if len(a) and a.queries.target[0] == number]
-            grids.append(interpolator.fill(join_samples(own), spec, number))
+            grids.append(fill_nodes(interpolator, join_samples(own), Nodes(spec, self.scene.fields[number], number)))
         return grids, self.asking + self.tracing + time.perf_counter() - begun
 
 
@@ -134,8 +135,7 @@ def covered(grids: list[IlluminationGrid], asked: Queries) -> NDArray[np.bool_]:
     result = np.zeros(len(asked), bool)
     for number, grid in enumerate(grids):
         own = asked.target == number
-        lit = (grid.support > 0).astype(np.float32)[..., None]
-        result[own] = read_lattice(grid.spec, lit, asked.point[own])[:, 0] > 1 - 1e-5
+        result[own] = grid.covered(asked.point[own])
     return result
 
 

@@ -8,12 +8,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from illumgrid.field.volume import Floats, Lattice, corners, index_to_world, interpolate, world_to_index
+from illumgrid.field.volume import Floats, Lattice, index_to_world, interpolate, world_to_index
 from illumgrid.tone import encode_srgb
 
 if TYPE_CHECKING:
     from illumgrid.bake import Progress
-    from illumgrid.grid import IlluminationGrid
     from illumgrid.light import Illumination
 
 NAMES = ("irradiance", "error", "support", "field", "color")
@@ -81,25 +80,10 @@ def _at(light: "Illumination", number: int, world: Floats, names: set[str]) -> d
         here["irradiance"] = grid.lookup(world)
         here["color"] = encode_srgb(display_linear(light, number, here["irradiance"]))
     if names & {"error", "support"}:
-        here["error"], here["support"] = certainty(grid, world)
+        here["error"], here["support"] = grid.certainty(world)
     if "field" in names:
         here["field"] = interpolate(field.volume, world_to_index(field.volume, world)).astype(np.float32)
     return here
-
-
-def certainty(grid: "IlluminationGrid", world: Floats) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Error and support (n,) of a lookup at world points (n, 3): those of the up to eight nodes that it mixes.
-
-    The error is their weighted mean, which holds however the nodes' errors hang together, and infinite where a node
-    has none; the support is the smallest.
-    """
-    error, support = np.zeros(len(world), np.float32), np.full(len(world), np.inf, np.float32)
-    for corner, share in corners(grid.spec, world_to_index(grid.spec, world)):
-        node, weight = tuple(corner.T), share.astype(np.float32)
-        mixed = weight > 0
-        error[mixed] += weight[mixed] * grid.error[node][mixed]
-        support[mixed] = np.minimum(support, grid.support[node])[mixed]
-    return error, support
 
 
 def x_fastest(array: NDArray[Any]) -> NDArray[Any]:
