@@ -211,7 +211,7 @@ def test_channels_are_mixed_to_what_is_shown():
     np.testing.assert_allclose(grid.bar, shown.bar, rtol=1e-5)
     wall = WallTexture(light.transpose(2, 1, 0, 3), ones.T, two)
     assert wall.lookup(0.5, 0.5, 0.5).shape == (1, 3) and wall.values.shape == (5, 4, 3, 3)
-    refused(lambda: IlluminationGrid(grid.spec, light, ones, ones), "(3, 4, 5, 2)", "1 (grey) or 3 (RGB)")
+    refused(lambda: IlluminationGrid(grid.spec, light, ones, ones), "2 channels", "1 (grey) or 3 (RGB)")
     refused(lambda: IlluminationGrid(grid.spec, light, ones, ones, RGB), "3: R, G, B")
 
 

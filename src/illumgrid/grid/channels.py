@@ -47,8 +47,15 @@ def channels_of(scene: Scene) -> Channels:
     return GREY if all((color == color[0]).all() for color in colors) else RGB
 
 
+def channels_for(count: int) -> Channels:
+    """The channels of an array that has so many and names none: 1 is grey, 3 is RGB."""
+    if count not in (1, 3):
+        raise BadInput(f"light of {count} channels came without their names; expected 1 (grey) or 3 (RGB)")
+    return GREY if count == 1 else RGB
+
+
 def kept(light: ArrayLike, channels: Channels | None = None) -> tuple[NDArray[np.float32], Channels]:
-    """Light as it is stored, (..., C) contiguous read-only float32, and its channels: by default 1 is grey, 3 is RGB.
+    """Light as it is stored, (..., C) contiguous read-only float32, and its channels, by default as `channels_for` says.
 
     Raises
     ------
@@ -56,13 +63,11 @@ def kept(light: ArrayLike, channels: Channels | None = None) -> tuple[NDArray[np
         If the last axis is not as long as there are channels.
     """
     array = np.asarray(light, dtype=np.float32)
-    count = array.shape[-1] if array.ndim else 0
-    if channels == GREY and count == 3 and array.strides[-1] == 0:
-        array, count = array[..., :1], 1  # the RGB view of grey light, as dataclasses.replace hands it on
-    expected = {1: GREY, 3: RGB} if channels is None else {len(channels): channels}
-    if count not in expected:
-        named = "1 (grey) or 3 (RGB)" if channels is None else f"{len(channels)}: {', '.join(channels.names)}"
-        raise BadInput(f"light came with shape {array.shape}; expected as many channels along the last axis as {named}")
+    if channels == GREY and array.shape[-1] == 3 and array.strides[-1] == 0:
+        array = array[..., :1]  # the RGB view of grey light, as dataclasses.replace hands it on
+    channels = channels_for(array.shape[-1]) if channels is None else channels
+    if len(channels) != array.shape[-1]:
+        raise BadInput(f"light of {array.shape[-1]} channels came; expected {len(channels)}: {', '.join(channels.names)}")
     stored = np.ascontiguousarray(array).view()
     stored.flags.writeable = False
-    return stored, expected[count]
+    return stored, channels
