@@ -55,7 +55,7 @@ def channels_for(count: int) -> Channels:
 
 
 def kept(light: ArrayLike, channels: Channels | None = None) -> tuple[NDArray[np.float32], Channels]:
-    """Light as it is stored, (..., C) contiguous read-only float32, and its channels, by default as `channels_for` says.
+    """Light as it is stored, (..., C) contiguous read-only float32, and its channels, by default by their count.
 
     Raises
     ------
@@ -66,8 +66,9 @@ def kept(light: ArrayLike, channels: Channels | None = None) -> tuple[NDArray[np
     if channels == GREY and array.shape[-1] == 3 and array.strides[-1] == 0:
         array = array[..., :1]  # the RGB view of grey light, as dataclasses.replace hands it on
     channels = channels_for(array.shape[-1]) if channels is None else channels
-    if len(channels) != array.shape[-1]:
-        raise BadInput(f"light of {array.shape[-1]} channels came; expected {len(channels)}: {', '.join(channels.names)}")
+    count = array.shape[-1]
+    if len(channels) != count:
+        raise BadInput(f"light of {count} channels came; expected {len(channels)}: {', '.join(channels.names)}")
     stored = np.ascontiguousarray(array).view()
     stored.flags.writeable = False
     return stored, channels
