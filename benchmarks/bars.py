@@ -1,7 +1,7 @@
-"""How often the error bar of a lookup covers the truth: the table of the page "Where methods fail".
+"""Coverage of the error bar of a lookup: the table of the page "Where methods fail".
 
-``python benchmarks/bars.py FOLDER`` takes blocks of 48³ voxels from the real volumes in a folder (where there
-is none, the fields made by code) and measures for some minutes.
+``python benchmarks/bars.py FOLDER`` takes blocks of 48³ voxels from the real volumes in FOLDER (without FOLDER, only
+synthetic fields) and runs for some minutes.
 """
 
 import argparse
@@ -28,7 +28,7 @@ REAL = {
 
 
 def block(volume: Volume, low: float, high: float) -> Volume:
-    """Cube of `SIDE` voxels (or the whole axis) with most voxels of the range."""
+    """Cube with a side of `SIDE` voxels (or the whole axis) that contains the most voxels of the range."""
     from scipy.ndimage import uniform_filter
 
     size = [min(SIDE, n) for n in volume.shape]
@@ -74,12 +74,12 @@ def measured(volume: Volume, low: float, high: float, share: float) -> tuple[flo
 
 
 def main() -> None:
-    """Measure all blocks at one node and half a node a voxel."""
+    """Measure all blocks at 1 and 0.5 nodes per voxel."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", nargs="?", type=Path)
     warnings.simplefilter("ignore")
     lines = [
-        "| block | nodes a voxel | covered | median bar / RMS error | RMS bar | RMS error | resolution |",
+        "| block | nodes per voxel | covered | median bar / RMS error | RMS bar | RMS error | resolution |",
         "|---|---|---|---|---|---|---|",
     ]
     for name, (volume, low, high) in fields(parser.parse_args().folder).items():

@@ -1,7 +1,7 @@
-"""How long the whole chain takes, as a user meets it: ``python benchmarks/chain.py [VOLUME --range LO HI]``.
+"""Time of the whole chain, as a user sees it: ``python benchmarks/chain.py [VOLUME --range LO HI]``.
 
-Whole processes, wall time and peak memory: ``--help``, the first run of the built-in scene (the kernels compile, into
-an empty cache), the second one, and, when a volume is named, a default run of it.
+Wall time and peak memory of whole processes: ``--help``, the first run of the built-in scene (which compiles the
+kernels into an empty cache), the second run, and, if VOLUME is given, a default run of it.
 """
 
 import argparse
@@ -31,8 +31,8 @@ def main():
         environment = {**os.environ, "NUMBA_CACHE_DIR": os.path.join(folder, "cache")}
         output = ["--overwrite", "-o", os.path.join(folder, "light")]
         timed("--help", ["--help"], environment)
-        timed("built-in scene, kernels to compile", ["run", *output], environment)
-        timed("built-in scene, second time", ["run", *output], environment)
+        timed("built-in scene, first run: compiles", ["run", *output], environment)
+        timed("built-in scene, second run", ["run", *output], environment)
         if asked.volume:
             limits = ["--range", *asked.range] if asked.range else []
             timed(os.path.basename(asked.volume), ["run", asked.volume, *limits, *output], environment)

@@ -1,21 +1,20 @@
-"""Speed and accuracy in figures: ``python benchmarks/chart.py [PART...] [--volumes DIR] [--json FILE] [--quick]``.
+"""Measurements of speed and accuracy: ``python benchmarks/chart.py [PART...] [--volumes DIR] [--json FILE] [--quick]``.
 
-promises
-    `--error` and `--seconds` on six scenes of 48³ voxels, against a truth on level sets: is what was asked kept?
-ways
+targets
+    Errors and times reached by `--error` and `--seconds` on six scenes of 48³ voxels, against a reference.
+stages
     `direct` with `nearest` against every other sampler and interpolator, each at its best setting, at equal error.
-goals
-    A smooth field of 96³ (forty Gaussians) and the MRI `stroke_T1`, raw and smoothed by a voxel, within a time.
-pays
-    After how many isovalues has the grid paid for itself against path tracing each isosurface anew at equal error?
+budgets
+    Error within a time, on a smooth field of 96³ (forty Gaussians) and the MRI `stroke_T1`, raw and smoothed.
+break_even
+    Number of isovalues from which a grid is cheaper than path tracing each isosurface anew at equal error.
 volumes
-    `bench` on real volumes (charts as PNG beside the JSON file), and where `run`'s default lies against the front.
-
+    `bench` on real volumes (charts as PNG beside the JSON file), and `run`'s default relative to the Pareto front.
 defaults
-    The default nodes and paths of `run` beside others, `direct` and `nearest`, on real volumes.
+    The default nodes and paths of `run` compared with others, `direct` with `nearest`, on real volumes.
 
-All with a white sky, albedo 0.8, 6 bounces unless chosen by the pilot, and the backend numba. Real volumes are looked
-for in DIR, by default ../shared/volumes from the repository's root, and passed over where they are not.
+All use a white sky, albedo 0.8, 6 bounces unless the pilot chooses them, and the backend numba. Real volumes are read
+from DIR, by default ../shared/volumes from the repository's root; missing ones are skipped.
 """
 
 import argparse
@@ -83,11 +82,11 @@ def timed(scene, **options):
     return light, time.perf_counter() - begun
 
 
-def promises(asked):
-    """Ratios of what came to what was asked."""
+def targets(asked):
+    """Ratios of reached to requested errors and times."""
     found = []
     for name, scene in fields().items():
-        rough = name == "in the box"  # where errors are larger and a path takes five times longer
+        rough = name == "in the box"  # its errors are larger, and a path takes five times as long
         truth = truth_of(scene, 0.02 if rough else 0.003, paths=1024 if rough else 4096)
         for option, values in (
             ("error", (0.1, 0.05) if rough else (0.05, 0.02, 0.01)),
@@ -102,30 +101,30 @@ def promises(asked):
                      "judged": light.recipe["reached"]}
                 )  # fmt: skip
                 chosen = f"grid {plan['grid']}, {plan['paths']} paths, met {plan['met']}"
-                came = f"{reached:7.2%} (judged {light.recipe['reached']:6.2%}) in {seconds:6.1f} s, ratio {ratio:5.2f}"
-                print(f"  {name:22} {option} {value:<5} {came}, {chosen}", flush=True)
+                reports = f"{reached:7.2%} (reported {light.recipe['reached']:6.2%}) in {seconds:6.1f} s"
+                print(f"  {name:22} {option} {value:<5} {reports}, ratio {ratio:5.2f}, {chosen}", flush=True)
     error = [f["ratio"] for f in found if "error" in f and f["plan"]["met"]]
     seconds = [f["ratio"] for f in found if "seconds" in f and f["plan"]["met"]]
-    print(f"  errors within 1.3: {np.mean(np.array(error) <= 1.3):.0%} of {len(error)}; "
+    print(f"  errors within a factor of 1.3: {np.mean(np.array(error) <= 1.3):.0%} of {len(error)}; "
           f"times within 20 %: {np.mean(np.abs(np.array(seconds) - 1) <= 0.2):.0%} of {len(seconds)}")  # fmt: skip
     return found
 
 
 def race_of(scene, budget):
-    """All points of a race with a fixed number of bounces, and its truth."""
+    """A race with a fixed number of bounces, run to the end of its budget."""
     truth = truth_of(scene, 0.004, levels=24, points=2400, bounces=BOUNCES)
     entrants, _ = every_way(scene, truth.queries, budget)
     entrants = [way for way in entrants if way.backend.name == "numba" and way.surface == "levelset"]
     race = Race(scene, {"levelset": replace(truth, bounces=BOUNCES)}, entrants, sizes(scene), BOUNCES, 0)
     begun = time.perf_counter()
-    # `bench` keeps time back to run each lane with more seeds, which is not done here.
-    while lane := race.next(SEEDS * (budget - (time.perf_counter() - begun))):
-        race.step(lane)
+    # `bench` reserves time to repeat settings with more seeds, which is not done here.
+    while setting := race.next(SEEDS * (budget - (time.perf_counter() - begun))):
+        race.step(setting)
     return race
 
 
-def ways(asked):
-    """At equal error: seconds of the paper's way, at its best, over those of direct."""
+def stages(asked):
+    """Time of each method, at its best setting, relative to direct with nearest at equal error."""
     cases = {"forty Gaussians": fields()["forty Gaussians"], "labyrinth": fields()["labyrinth"]}
     if (place := asked.volumes / "stroke_T1.nii.gz").exists():
         cases["stroke_T1, smoothed"] = Scene.sky(smooth(read_volume(place), 1.0), range=(60, 110))
@@ -133,28 +132,28 @@ def ways(asked):
     for name, scene in cases.items():
         race = race_of(scene, 60 if asked.quick else 120)
         exact = race.truths["levelset"]
-        lanes = {}
+        curves = {}
         for p in race.points:
-            lanes.setdefault(f"{p.way.sampler.name}, {p.interpolator.name}", []).append(p)
-        best_of = {label: front(points, race.truths) for label, points in sorted(lanes.items())}
+            curves.setdefault(f"{p.way.sampler.name}, {p.interpolator.name}", []).append(p)
+        best_of = {label: front(points, race.truths) for label, points in sorted(curves.items())}
         own = best_of["direct, nearest"]
         times, rmse = np.log([p.time for p in own]), np.log([p.rmse(exact) for p in own])
         for label, best in best_of.items():
-            # What direct takes for the error of each of their points, read off its own front.
+            # The time of direct at the error of each of their points, interpolated on its own front.
             ratios = [
                 float(p.time / np.exp(np.interp(-np.log(p.rmse(exact)), -rmse, times)))
                 for p in best
                 if np.exp(rmse.min()) <= p.rmse(exact) <= np.exp(rmse.max())
             ]
             found.setdefault(name, {})[label] = {"ratios": ratios, "best": [(p.time, p.rmse(exact)) for p in best]}
-            said = ", ".join(f"{ratio:.1f}" for ratio in ratios) or "never as good, or as quick"
+            shown = ", ".join(f"{ratio:.1f}" for ratio in ratios) or "no point at an error that direct reaches"
             least = f"least error {best[-1].rmse(exact):7.2%} in {best[-1].time:6.1f} s"
-            print(f"  {name:20} {label:18} {least}; times direct: {said}")
+            print(f"  {name:20} {label:18} {least}; time relative to direct: {shown}")
     return found
 
 
-def goals(asked):
-    """The light of two fields within a time."""
+def budgets(asked):
+    """Error of two fields within a time."""
     cases = {"forty Gaussians, 96": (Scene.sky(gaussians(96), range=(0.2, 1.2)), 20, (96, 64))}
     if (place := asked.volumes / "stroke_T1.nii.gz").exists():
         raw = read_volume(place)
@@ -175,8 +174,8 @@ def goals(asked):
     return found
 
 
-def pays(asked):
-    """Isovalues after which the grid is cheaper than path tracing every isosurface anew, at the same error."""
+def break_even(asked):
+    """Number of isovalues from which the grid is cheaper than path tracing every isosurface anew, at equal error."""
     cases = {"forty Gaussians": fields()["forty Gaussians"]}
     if (place := asked.volumes / "stroke_T1.nii.gz").exists():
         cases["stroke_T1, smoothed"] = Scene.sky(smooth(read_volume(place), 1.0), range=(60, 110))
@@ -187,62 +186,62 @@ def pays(asked):
         each, lookup = [], []
         for t in (0.2, 0.5, 0.8):
             level = float(scene.levels(t)[0, 0])
-            vertices = isosurface(scene.fields[0].volume, level).vertices  # which both ways need
+            vertices = isosurface(scene.fields[0].volume, level).vertices  # needed by both
             begun = time.perf_counter()
             points = Queries.at(scene, vertices, level=level)
             one, other = trace(scene, backend("numba"), points, range(32), BOUNCES, 0)
             tracing = (time.perf_counter() - begun) / 2
             noise = np.sqrt(((one.mean - other.mean)[one.paths > 0] ** 2).mean() / 2) / one.mean.mean()
-            each.append(tracing * max(1.0, 16 * (noise / 0.03) ** 2) / 16)  # paths that make the noise equal
+            each.append(tracing * max(1.0, 16 * (noise / 0.03) ** 2) / 16)  # for the paths that equal the error
             begun = time.perf_counter()
             light.grids[0].lookup(vertices)
             lookup.append(time.perf_counter() - begun)
         after = whole / max(1e-9, np.mean(each) - np.mean(lookup))
         found[name] = {"grid_seconds": whole, "each_seconds": each, "lookup_seconds": lookup, "isovalues": after}
         print(f"  {name:20} grid {whole:.1f} s, each isosurface {np.mean(each):.2f} s, lookup {np.mean(lookup):.3f} s: "
-              f"paid for after {after:.0f} isovalues")  # fmt: skip
+              f"breaks even after {after:.0f} isovalues")  # fmt: skip
     return found
 
 
 def volumes(asked):
-    """Charts of real volumes, and the error and time of run's defaults beside the front."""
+    """Charts of real volumes, and error and time of run's default relative to the front."""
     found = {}
     for name, limits in RANGES.items():
         if not (asked.volumes / name).exists():
             continue
         scene = Scene.sky(read_volume(asked.volumes / name), range=limits)
         result = bench(scene, 40 if asked.quick else 80)
-        content, said = report.files(result, name.split(".")[0], scene)
+        content, summary = report.files(result, name.split(".")[0], scene)
         (asked.json.parent / f"chart-{name.split('.')[0]}.png").write_bytes(content["chart.png"])
         exact = result.truths["levelset"]
         default = next(p for p in result.points if p.default)
         took, rmse = default.time, default.rmse(exact)
         error = {p: p.rmse(result.truths[p.way.surface]) for p in result.points}
-        beaten = [p for p in result.front if p.time < took and error[p] < rmse]
-        advice = said.splitlines()[-1]
+        dominating = [p for p in result.front if p.time < took and error[p] < rmse]
+        advice = summary.splitlines()[-1]
         found[name] = {
-            "default": {"seconds": took, "built": default.built, "rmse": rmse, "beaten": len(beaten)},
+            "default": {"seconds": took, "built": default.built, "rmse": rmse, "dominated by": len(dominating)},
             "truth": exact.error, "least": min(e for p, e in error.items() if p.way.surface == "levelset"),
             "advice": advice,
         }  # fmt: skip
-        better = [f"{p.label} {p.grid} x {p.paths} ({p.time:.1f} s, {error[p]:.2%})" for p in beaten]
+        better = [f"{p.label} {p.grid} x {p.paths} ({p.time:.1f} s, {error[p]:.2%})" for p in dominating]
         least = found[name]["least"]
-        print(f"  {name:20} default {'' if default.built else '~'}{took:.1f} s {rmse:7.2%}; beaten by "
-              f"{', '.join(better) or 'nobody'}; truth {exact.error:.2%}, {least / exact.error:.1f} of the least error",
-              flush=True)  # fmt: skip
+        print(f"  {name:20} default {'' if default.built else '~'}{took:.1f} s {rmse:7.2%}; dominated by "
+              f"{', '.join(better) or 'none'}; reference {exact.error:.2%}, "
+              f"least error {least / exact.error:.1f} times that", flush=True)  # fmt: skip
         print(f"    {advice}", flush=True)
     return found
 
 
 def defaults(asked):
-    """The default of `run` beside other nodes and paths, on real volumes: `direct`, `nearest`, the same truth."""
+    """The default of `run` and other nodes and paths on real volumes: `direct`, `nearest`, the same reference."""
     tried = ((0.6, 128), (0.85, 64), (1.0, 64), (1.2, 16), (1.2, 32), (1.2, 64), (1.41, 16), (1.9, 8))
     found = {}
     for name, limits in RANGES.items():
         if not (asked.volumes / name).exists():
             continue
         scene = Scene.sky(read_volume(asked.volumes / name), range=limits)
-        longest = min(125, max(scene.fields[0].volume.shape))  # so that 1.2 of it is the default
+        longest = min(125, max(scene.fields[0].volume.shape))  # 1.2 nodes per voxel is then the default
         truth = truth_of(scene, 0.01, levels=24, points=6000, paths=512)
         found[name] = []
         for density, paths in tried:
@@ -250,12 +249,12 @@ def defaults(asked):
             found[name].append((density, paths, took, off(light, truth).rmse))
         took = {(d, p): (t, e) for d, p, t, e in found[name]}
         own = took[1.2, 32]
-        said = "; ".join(f"{d:g} x {p}: {t / own[0]:.2f}, {e:.2%}" for (d, p), (t, e) in took.items())
-        print(f"  {name:20} default {own[0]:.2f} s; nodes x paths: times it, error: {said}", flush=True)
+        shown = "; ".join(f"{d:g} x {p}: {t / own[0]:.2f}, {e:.2%}" for (d, p), (t, e) in took.items())
+        print(f"  {name:20} default {own[0]:.2f} s; nodes x paths: relative time, error: {shown}", flush=True)
     return found
 
 
-PARTS = {part.__name__: part for part in (promises, ways, goals, pays, volumes, defaults)}
+PARTS = {part.__name__: part for part in (targets, stages, budgets, break_even, volumes, defaults)}
 
 
 def main():

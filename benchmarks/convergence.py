@@ -1,8 +1,8 @@
-"""How the error falls with the number of paths, and whether its bars tell: ``python benchmarks/convergence.py``.
+"""Error against number of paths, and coverage of the error bars: ``python benchmarks/convergence.py``.
 
-Writes the figure and the table of the page "Is it right?" (`docs/images/convergence.png`, `convergence_table.md`): two
-minutes on one thread. `numba` marches nine scenes. The truth is two independent means A and B of many paths each: the
-mean of (light - A)(light - B) is the squared error of the light, without any of theirs.
+Writes the figure and the table of the page "Is it right?" (`docs/images/convergence.png`, `convergence_table.md`) in
+two minutes on one thread. `numba` marches nine scenes. The reference consists of two independent means A and B of many
+paths each: the mean of (light - A)(light - B) is the squared error of the light, free of the errors of A and B.
 """
 
 import os
@@ -20,11 +20,11 @@ from illumgrid.transport.samples import join_queries
 
 IMAGES = Path(__file__).parent.parent / "docs" / "images"
 COUNTS = 4 * 2 ** np.arange(8)
-SEEDS = 3  # of every count, to steady the curves
-LONG = (8192, 200)  # paths of a truth of the curves, and its queries
-WIDE = (2048, 1000)  # of the bars
+SEEDS = 3  # per number of paths, to smooth the curves
+LONG = (8192, 200)  # reference of the curves: paths and queries
+WIDE = (2048, 1000)  # reference of the bars: paths and queries
 BOUNCES = 4
-ROUNDING = 2e-6  # of the light: many a query whose paths are all worth the same has a bar of 0, rightly
+ROUNDING = 2e-6  # relative: queries whose paths all contribute the same have, correctly, a bar of 0
 SOLVE = backend("numba", threads=1).solve
 
 
@@ -45,7 +45,7 @@ def scenes():
 
 
 def others():
-    """More scenes for the bars: light of all lamps and walls, noise on a smooth field, and hardly any shadow."""
+    """More scenes for the bars: light from lamps and walls, noise on a smooth field, and hardly any shadow."""
     smooth, slight, maze = gaussians(32), hills(24), Scene.floor(labyrinth(24), range=(-0.4, 0.4))
     noise = np.random.default_rng(0).normal(scale=0.03, size=smooth.values.shape)
     return {
@@ -60,7 +60,7 @@ def others():
 
 
 def small_lamps(scene):
-    """Two lamps above the field, a hundredth of its extent in area."""
+    """Two lamps above the field, each with a hundredth of its area."""
     volume = scene.fields[0].volume
     size = np.array(volume.shape) * volume.spacing
     edge, glow = 0.12 * size.max(), Material(np.zeros(3), np.full(3, 30.0))
@@ -69,7 +69,7 @@ def small_lamps(scene):
 
 
 def asked(scene, count):
-    """`count` queries on eight level sets that have a normal, in any order."""
+    """`count` queries with a normal on eight level sets, in random order."""
     rows = scene.levels((np.arange(8) + 0.5) / 8)
     queries = join_queries(list(on_level_sets(scene, rows, 0, points=count // 6)))
     queries = queries[queries.normal.any(axis=1)]
@@ -93,9 +93,9 @@ def curve(scene):
     return np.sqrt(squares) / one.mean()
 
 
-def bars(scene, paths, truths):
-    """Share of the queries' colours whose 95 % bar covers the truth, and the median bar over the RMS error."""
-    (one, its), (other, others) = truths
+def bars(scene, paths, references):
+    """Share of the queries' colours whose 95 % bar covers the reference, and the median bar over the RMS error."""
+    (one, its), (other, others) = references
     mean, bar = light(scene, asked(scene, WIDE[1]), paths, 0)
     rms = np.sqrt(np.mean((mean - one) * (mean - other)))
     off, wide = np.abs(mean - 0.5 * (one + other)), np.hypot(bar, 0.5 * np.hypot(its, others))
@@ -114,7 +114,7 @@ def draw(curves):
         axes.loglog(COUNTS, 100 * error, marker=marker, color=color, label=f"{name}: paths$^{{{slope(error):.2f}}}$")
     start = 130 * max(error[0] for error in curves.values())
     axes.loglog(COUNTS, start * (COUNTS / COUNTS[0]) ** -0.5, "--", color="0.5", label="paths$^{-0.5}$")
-    axes.set(xlabel="paths from every query", ylabel="RMS error, % of the mean light")
+    axes.set(xlabel="paths per query", ylabel="RMS error, % of the mean light")
     axes.set_xticks(COUNTS, [str(n) for n in COUNTS])
     axes.minorticks_off()
     axes.set_yticks([0.1, 0.3, 1, 3, 10, 30], ["0.1", "0.3", "1", "3", "10", "30"])
@@ -124,7 +124,7 @@ def draw(curves):
 
 
 def slope(error):
-    """Exponent of the power of the number of paths that fits best."""
+    """Exponent of the best-fitting power law in the number of paths."""
     return np.polyfit(np.log(COUNTS), np.log(error), 1)[0]
 
 
@@ -133,11 +133,11 @@ def main():
     for name, scene in {**scenes(), **others()}.items():
         if name in scenes():
             curves[name] = curve(scene)
-            told = "  ".join(f"{n}: {e:.3%}" for n, e in zip(COUNTS, curves[name]))
-            print(f"{name}: paths^{slope(curves[name]):.2f}   {told}", flush=True)
-        truths = [light(scene, asked(scene, WIDE[1]), WIDE[0], 1000 + k) for k in (0, 1)]
+            errors = "  ".join(f"{n}: {e:.3%}" for n, e in zip(COUNTS, curves[name]))
+            print(f"{name}: paths^{slope(curves[name]):.2f}   {errors}", flush=True)
+        references = [light(scene, asked(scene, WIDE[1]), WIDE[0], 1000 + k) for k in (0, 1)]
         for paths in (16, 32, 64, 256):
-            covered, ratio = bars(scene, paths, truths)
+            covered, ratio = bars(scene, paths, references)
             lines.append(f"| {name} | {paths} | {covered:.1%} | {ratio:.2f} |")
             print(lines[-1], flush=True)
     draw(curves)

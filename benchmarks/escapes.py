@@ -1,8 +1,9 @@
-"""How many paths escape from sealed cavities: ``python benchmarks/escapes.py [--paths N] [--backend NAME ...]``.
+"""Number of paths that escape from sealed cavities: ``python benchmarks/escapes.py [--paths N] [--backend NAME ...]``.
 
-White walls all around, light only outside: a path that brings light has leaked. Ten million paths for each backend and
-surface, shared by solids of voxel noise (reals, bytes, four grays: the last is full of plateaus and edges) and rooms of
-six quads asked all over and in their corners, at scales of 1e-6, 1 and 1e6, at the origin and 1e5 extents away from it.
+The cavities are white and the only light is outside, so a path that carries light has leaked. Each backend and surface
+traces ten million paths, divided among solids of voxel noise (reals, bytes, and four grays, which are full of plateaus
+and edges) and rooms of six quads, queried everywhere and in their corners, at scales of 1e-6, 1 and 1e6, at the origin
+and 1e5 extents away from it.
 """
 
 import argparse
@@ -42,7 +43,7 @@ def cave(values, scale, extents):
 
 
 def room(scale, extents):
-    """Six walls around next to nothing, asked at random, near their edges and in their corners."""
+    """Six walls around an almost empty field, queried at random, near their edges and in their corners."""
     values = np.zeros((3, 3, 3))
     values[1, 1, 1] = 1
     spacing = scale * np.array([1.0, 0.7, 1.6])
@@ -71,7 +72,7 @@ def room(scale, extents):
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--paths", type=int, default=10_000_000)
-    parser.add_argument("--backend", action="append", help="such as numba:mesh; by default all there are")
+    parser.add_argument("--backend", action="append", help="such as numba:mesh; by default all available")
     asked = parser.parse_args()
     wrong = 0
     for name, backend in contenders().items():

@@ -1,15 +1,14 @@
-"""What one new isovalue costs, part by part: ``python benchmarks/frame.py [--engine egl] [--json FILE]``.
+"""Cost of a new isovalue, part by part: ``python benchmarks/frame.py [--engine egl] [--json FILE]``.
 
-A sum of forty Gaussians on 128³ and on 256³ voxels, an illumination grid of 96³ nodes, pictures of 800 x 600. A frame
-is extraction (the capped isosurface and which of its faces are caps), lookup (the light at every vertex), tone (sRGB),
-and drawing (everything else that OpenGL is asked for, the transfer included). Beside it stands the same frame in which
-every vertex has one colour that nobody computes: less than any local light costs. What light adds to that frame is an
-upper bound of what it adds to one with local light. `--local` of ``illumgrid preview`` is timed too: its gradient
-normals cost more than the lookup.
+The field is a sum of forty Gaussians on 128³ and on 256³ voxels, with an illumination grid of 96³ nodes and pictures of
+800 x 600. A frame consists of extraction (the capped isosurface and which of its faces are caps), lookup (the light at
+every vertex), tone (sRGB), and drawing (all other OpenGL work, the transfer included). It is compared with the same
+frame with one constant vertex colour, which is cheaper than any local light. The added cost of global light is thus an
+upper bound of its added cost over local light. `--local` of ``illumgrid preview`` is timed too: its gradient normals
+cost more than the lookup.
 
-The frames take turns; times are medians of the rounds, by the clock on the wall, shares are of the same round. The rate
-of the lookup is that of the fastest round, one thread's own time. Where VTK is installed, its flying edges are timed
-on the same field.
+The frames take turns. Times are medians over rounds, in wall time; shares are within one round. The rate of the lookup
+is that of the fastest round, in time of one thread. If VTK is installed, its flying edges are timed on the same field.
 """
 
 import argparse
@@ -33,7 +32,7 @@ NODES, WIDTH, HEIGHT = 96, 800, 600
 
 
 def lit(volume):
-    """Illumination of smooth light: what it is does not matter here."""
+    """Illumination with arbitrary smooth light."""
     scene = Scene.sky(volume, range=(0.2, 0.9))
     spec = GridSpec.over(volume, NODES)
     wave = 2 + np.sin(np.indices(spec.shape).sum(axis=0) / 9)
@@ -58,7 +57,7 @@ def flying_edges(values):
 
 
 def measure(voxels, engine, rounds):
-    """All figures of one size of field."""
+    """All measurements for one field size."""
     light = lit(gaussians(voxels))
     field, row = light.scene.fields[0], np.array([ISOVALUE])
     camera, ground = fit_camera(light.scene, row, WIDTH / HEIGHT), np.full(3, BACKGROUND, np.float32)
@@ -89,14 +88,14 @@ def measure(voxels, engine, rounds):
     return {
         "vertices": len(points),
         "extraction ms": 1e3 * float(np.median(extraction)),
-        "of it scikit-image and trimesh ms": 1e3 * float(np.median(times["isosurface"])),
+        "thereof scikit-image and trimesh ms": 1e3 * float(np.median(times["isosurface"])),
         "lookup ms": 1e3 * float(np.median(times["lookup and exposure"])),
         "tone ms": 1e3 * float(np.median(times["tone"])),
         "drawing ms": 1e3 * float(np.median(drawing)),
         "whole frame ms": 1e3 * float(np.median(times["frame"])),
         "frame with --local ms": 1e3 * float(np.median(times["local frame"])),
         "light adds %": 100 * float(np.median(light_time / (extraction + drawing))),
-        "lookup, million points a second": rate,
+        "lookup, million points per second": rate,
         **{f"{n} ms": 1e3 * float(np.median(times[n])) for n in ("VTK flying edges",) if n in times},
     }
 
@@ -105,12 +104,12 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--engine", default="auto", help="egl, osmesa, or auto")
     parser.add_argument("--rounds", type=int, default=7)
-    parser.add_argument("--json", help="write the figures here")
+    parser.add_argument("--json", help="file for the measurements")
     asked = parser.parse_args()
     engine, why = choose_engine(asked.engine)
     print(f"engine: {engine} ({why})")
     if engine == "software":
-        parser.error("there is no OpenGL here; expected EGL or OSMesa")
+        parser.error("no OpenGL is available; expected EGL or OSMesa")
     figures = {voxels: measure(voxels, engine, asked.rounds) for voxels in (128, 256)}
     for name in figures[128]:
         print(f"{name:36} {figures[128][name]:10.1f} {figures[256][name]:10.1f}")

@@ -1,12 +1,12 @@
-"""Gaps in space that a sampler's level sets leave: ``python benchmarks/gaps.py VOLUME LO HI [...] [--figure PNG]``.
+"""Gaps in space between a sampler's level sets: ``python benchmarks/gaps.py VOLUME LO HI [...] [--figure PNG]``.
 
-Points of the object, even over the space that a sweep reaches, are asked how far the nearest level set is that the
-sampler visits: the corners and middles of its triangles stand for it. `uniform` and `adaptive` use as many
-levels. The figure shows, against the level of the points, the median and the 99th percentile of the distance.
+Measures the distance from points of the object, uniform over the space that a sweep reaches, to the nearest level set
+that the sampler visits, represented by the corners and centres of its triangles. `uniform` and `adaptive` use the same
+number of levels. The figure shows the median and the 99th percentile of the distance against the level of the points.
 
-With ``--error`` the light is computed as well, and what matters in the end is measured: relative RMSE and median error
-of lookups at points on isovalues that no sampler visited, drawn evenly from the range. As many levels, points and
-paths for each sampler, and the same interpolators.
+``--error`` also computes the light and measures the resulting error: relative RMSE and median error of lookups at
+points on isovalues that no sampler visited, drawn uniformly from the range. All samplers use the same numbers of
+levels, points and paths, and the same interpolators.
 """
 
 import argparse
@@ -28,7 +28,7 @@ POINTS, BINS = 50_000, 25
 
 
 def points_within(scene, seed=0):
-    """World points (n, 3), even over the part of the field whose value lies within the range, and their values (n,)."""
+    """World points (n, 3), uniform over the part of the field with values in the range, and their values (n,)."""
     field = scene.fields[0]
     random, found, levels = np.random.default_rng(seed), [], []
     while sum(map(len, found)) < POINTS:
@@ -49,7 +49,7 @@ def gaps(scene, rows, points):
 
 
 def samplers(scene, count):
-    """The levels of each way to choose them."""
+    """The levels that each sampler chooses."""
     return {
         "uniform": level_table(scene, count).table,
         "adaptive, no topology": adaptive_rows(scene, count, topology=0.0),
@@ -58,7 +58,7 @@ def samplers(scene, count):
 
 
 def measure(path, limits, sigma, count):
-    """Name, values of the points, and the gaps of each sampler, of one volume."""
+    """Name, values of the points, and gaps of each sampler, for one volume."""
     scene = Scene.sky(smooth(read_volume(path), sigma), range=limits)
     points, level = points_within(scene)
     return (
@@ -68,7 +68,7 @@ def measure(path, limits, sigma, count):
     )
 
 
-TRUTH = {"paths": range(1024), "bounces": 4, "seed": 77}
+REFERENCE = {"paths": range(1024), "bounces": 4, "seed": 77}
 
 
 def errors(scene, levels, nodes, points, paths):
@@ -77,20 +77,20 @@ def errors(scene, levels, nodes, points, paths):
     unseen = scene.levels(np.random.default_rng(5).random(12))
     asked = join_queries(list(on_level_sets(scene, unseen, 77, points=100)))
     asked = asked[asked.normal.any(axis=1)]
-    truth = backend.solve(scene, asked, **TRUTH).mean
+    truth = backend.solve(scene, asked, **REFERENCE).mean
     for sampler, rows in levels.items():
         queries = join_queries(list(on_level_sets(scene, rows, 0, specs=[spec], points=points)))
-        samples = backend.solve(scene, queries, paths=range(paths), bounces=TRUTH["bounces"], seed=0)
-        told = []
+        samples = backend.solve(scene, queries, paths=range(paths), bounces=REFERENCE["bounces"], seed=0)
+        found = []
         for name in ("nearest", "splat", "rbf"):
             miss = interpolator(name).fill(samples, Nodes(spec, scene.fields[0])).lookup(asked.point) - truth
-            told.append(f"{name} {np.sqrt(np.mean(miss**2)) / truth.mean():.3f} / "
+            found.append(f"{name} {np.sqrt(np.mean(miss**2)) / truth.mean():.3f} / "
                         f"{np.median(np.abs(miss)) / truth.mean():.4f}")  # fmt: skip
-        print(f"  {sampler:24} {len(rows)} levels, {len(queries)} queries:  " + "   ".join(told), flush=True)
+        print(f"  {sampler:24} {len(rows)} levels, {len(queries)} queries:  " + "   ".join(found), flush=True)
 
 
 def draw(results, count, file):
-    """One panel a volume: median and 99th percentile of the gap against the level."""
+    """One panel per volume: median and 99th percentile of the gap against the level."""
     import matplotlib
 
     matplotlib.use("Agg")

@@ -1,11 +1,11 @@
 """Time, memory and error of the interpolators: ``python benchmarks/interpolators.py [--samples N] [--nodes N]``.
 
 All fill the same grid from the same samples of a light that is known everywhere: on 24 concentric spheres, the level
-sets that a sampler would visit, with noise of 2 % or none. The error is that of a lookup at random points between the
-spheres. Each runs in a process of its own, whose peak memory is told, after a small fill that compiles what there is to
-compile. The processor's seconds are those of all threads together.
+sets that a sampler would visit, with noise of 2 % or none. The error is that of lookups at random points between the
+spheres. Each interpolator runs in its own process, whose peak memory is reported, after a small fill that triggers
+compilation. Processor seconds are summed over all threads.
 
-With ``--scipy``, SciPy's own `RBFInterpolator` as well: the same neighbours, on a part of the nodes.
+``--scipy`` also times SciPy's `RBFInterpolator`, with the same neighbours on a part of the nodes.
 """
 
 import argparse
@@ -28,7 +28,7 @@ def light(points):
 
 
 def on_spheres(count, nodes, noise):
-    """Samples of the light on spheres of radius 0.1 to 0.5 about the middle of the unit box, even by area."""
+    """Samples of the light on spheres of radius 0.1 to 0.5 around the centre of the unit box, uniform by area."""
     random = np.random.default_rng(0)
     radii = np.linspace(0.1, 0.5, SPHERES)
     which = random.choice(SPHERES, count, p=radii**2 / (radii**2).sum())
@@ -43,8 +43,8 @@ def on_spheres(count, nodes, noise):
     return Samples(queries, mean, m2, np.full(count, 4, np.int32))
 
 
-def truth_points(nodes):
-    """Points (n, 3) between the innermost sphere and the outermost, in the unit box and in the grid."""
+def points_between(nodes):
+    """Points (n, 3) between the innermost and the outermost sphere, in the unit box and in the grid."""
     random = np.random.default_rng(1)
     points = random.random((100_000, 3))
     distance = np.linalg.norm(points - 0.5, axis=1)
@@ -53,7 +53,7 @@ def truth_points(nodes):
 
 
 def measure(name, count, nodes, noise, pipe):
-    """Fill once, in this process, and send the figures."""
+    """Fill once, in this process, and send the measurements."""
     stage = interpolator(name)
     stage.fill(on_spheres(2000, 12, noise), Nodes(GridSpec((12, 12, 12)), None))  # no stage here reads the field
     samples, spec = on_spheres(count, nodes, noise), GridSpec((nodes,) * 3)
@@ -62,14 +62,14 @@ def measure(name, count, nodes, noise, pipe):
     grid = stage.fill(samples, Nodes(spec, None))
     wall, busy = time.perf_counter() - wall, time.process_time() - busy
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    at, place = truth_points(nodes)
+    at, place = points_between(nodes)
     miss = grid.lookup(place)[:, 0] - light(at)
     pipe.send((wall, busy, before, peak, np.sqrt(np.mean(miss**2)) / light(at).mean(),
                np.median(np.abs(miss)) / light(at).mean(), float((grid.support == 0).mean())))  # fmt: skip
 
 
 def scipy_seconds(count, nodes, part=20_000):
-    """Seconds that SciPy's local splines would take for all nodes, from a part of them."""
+    """Seconds that SciPy's local splines would take for all nodes, extrapolated from a part of them."""
     from scipy.interpolate import RBFInterpolator
 
     samples = on_spheres(count, nodes, 0.0)
@@ -87,7 +87,7 @@ def main():
     parser.add_argument("--scipy", action="store_true")
     asked = parser.parse_args()
     spawn = multiprocessing.get_context("spawn")
-    print(f"{asked.samples} samples on {SPHERES} spheres onto {asked.nodes}³ nodes")
+    print(f"{asked.samples} samples on {SPHERES} spheres, {asked.nodes}³ nodes")
     for noise in (0.0, NOISE):
         print(f"noise {noise:.0%}:")
         for name in ("nearest", "splat", "rbf"):
@@ -96,7 +96,7 @@ def main():
             child.start()
             wall, busy, before, peak, rmse, median, holes = ours.recv()
             child.join()
-            print(f"  {name:8} {wall:6.1f} s, {busy:6.1f} s of processors  peak {peak:5.0f} MB, {before:4.0f} before   "
+            print(f"  {name:8} {wall:6.1f} s, {busy:6.1f} CPU s  peak {peak:5.0f} MB, {before:4.0f} before   "
                   f"relative RMSE {rmse:.4f}, median {median:.4f}   holes {holes:.1%}", flush=True)  # fmt: skip
     if asked.scipy:
         print(f"  RBFInterpolator, neighbors=16: about {scipy_seconds(asked.samples, asked.nodes):.0f} s")

@@ -1,14 +1,14 @@
-"""Kills at random moments of ``illumgrid run``: ``python benchmarks/kills.py [--kills N] [--seed N]``.
+"""Kills ``illumgrid run`` at random moments: ``python benchmarks/kills.py [--kills N] [--seed N]``.
 
-Each kill starts a run of a tiny volume in a process of its own and ends it by SIGKILL, at a moment drawn evenly from
-the run's duration. Half of them go to a DIR that is not there, half, with ``--overwrite``, to one that holds a finished
-run. As most of a run is imports and light, which write nothing, every other moment is drawn from the time of writing:
-it begins when the hidden folder ``.DIR-...`` beside DIR appears, and lasts as long as in a run that nobody killed.
+Each kill starts a run of a tiny volume in its own process and ends it by SIGKILL, at a moment drawn uniformly from the
+run's duration. Half of the runs write to a new DIR, half, with ``--overwrite``, to one that holds a finished run. Most
+of a run is imports and light, which write nothing, so every other moment is drawn from the time of writing: it begins
+when the hidden folder ``.DIR-...`` beside DIR appears, and lasts as long as in an uninterrupted run.
 
-Afterwards DIR must be absent or whole (it is read back and compared with what its seed gives; with ``--overwrite`` the
-old result counts as whole), nothing may lie beside it but hidden folders, and the next run into the same DIR must work.
-Between the two renames of ``--overwrite`` DIR is absent, and both results are whole in the hidden folder: that is told.
-Exit code 1 if anything else is found.
+Afterwards DIR must be absent or complete (it is read back and compared with the result of its seed; with
+``--overwrite`` the old result counts as complete), only hidden folders may lie beside it, and the next run into the
+same DIR must work. Between the two renames of ``--overwrite``, DIR is absent and both results are complete in the
+hidden folder; the summary counts this case. The exit code is 1 if anything else is found.
 """
 
 import argparse
@@ -26,9 +26,9 @@ import numpy as np
 
 import illumgrid as ig
 
-OLD, NEW = 1, 2  # seeds of what is there and of what is on its way
+OLD, NEW = 1, 2  # seeds of the existing result and of the one being written
 OPTIONS = ("--range", "0.3", "0.9", "--grid", "24", "--paths", "4", "--threads", "1")
-STEP = 0.0002  # seconds between two looks
+STEP = 0.0002  # seconds between polls
 
 
 def start(folder, seed):
@@ -43,13 +43,13 @@ def hidden(folder, prefix=".out-"):
 
 
 def writing(folder, process):
-    """Wait until the process has begun to write, or is over."""
+    """Wait until the process has begun to write, or has ended."""
     while not hidden(folder) and process.poll() is None:
         time.sleep(STEP)
 
 
 def durations(folder):
-    """Seconds from start to writing, of writing, and from there to the end, of a run that nobody kills."""
+    """Seconds from start to writing, of writing, and from there to the end, for an uninterrupted run."""
     begun = time.perf_counter()
     process = start(folder, OLD)
     writing(folder, process)
@@ -62,13 +62,13 @@ def durations(folder):
 
 
 def same(out, light):
-    """DIR is whole: it is read, by its checksum, and holds this light."""
+    """Whether DIR is complete: it can be read, with its checksum, and holds this light."""
     back = ig.load(out)
     return all(np.array_equal(a.values, b.values) for a, b in zip(back.grids, light.grids, strict=True))
 
 
 def whole(out, lights):
-    """Seed of the result that DIR holds, None if it is absent; raises if it is anything else."""
+    """Seed of the result in DIR, None if DIR is absent; raises for anything else."""
     if not out.exists():
         return None
     found = [seed for seed, light in lights.items() if same(out, light)]
@@ -77,7 +77,7 @@ def whole(out, lights):
 
 
 def kill(folder, finished, lights, chance, durations, late):
-    """One kill; what was found."""
+    """Kill one run and classify what it left."""
     out = folder / "out"
     if finished:
         shutil.copytree(finished, out)
@@ -91,17 +91,17 @@ def kill(folder, finished, lights, chance, durations, late):
     process.send_signal(signal.SIGKILL)
     ended = process.wait()
     seed, left = whole(out, lights), hidden(folder, ".")
-    strangers = {p.name for p in folder.iterdir()} - {"v.npy", "out", *(p.name for p in left)}
-    assert not strangers, strangers
+    unexpected = {p.name for p in folder.iterdir()} - {"v.npy", "out", *(p.name for p in left)}
+    assert not unexpected, unexpected
     if ended == 0:
-        found = "over before the kill"
+        found = "ended before the kill"
         assert seed == NEW
     elif seed is None and finished:
-        found = "absent between two renames, both results whole beside it"
+        found = "absent between two renames, both results complete beside it"
         (place,) = left
         assert whole(place / "old", lights) == OLD and whole(place / "new", lights) == NEW
     else:
-        found = {None: "absent", OLD: "the old result, whole", NEW: "the new result, whole"}[seed]
+        found = {None: "absent", OLD: "the old result, complete", NEW: "the new result, complete"}[seed]
         assert seed in ((OLD, NEW) if finished else (None, NEW))
     if left:
         found += ", a hidden folder left beside it"
@@ -128,8 +128,8 @@ def main():
             lights[seed] = ig.load(place / "out")
         shutil.copytree(place / "out", place / "kept")
         times = durations(place)
-        told = "before it writes, {:.3f} s while it writes and {:.2f} s from there to its end".format(*times[1:])
-        print(f"a run takes {times[0]:.2f} s {told}", flush=True)
+        before, during, after = times
+        print(f"a run takes {before:.2f} s before, {during:.3f} s during and {after:.2f} s after writing", flush=True)
         for number in range(asked.kills):
             over, late = number % 2 == 1, number // 2 % 2 == 1
             folder = Path(work) / str(number)

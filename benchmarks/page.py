@@ -1,7 +1,7 @@
-"""The interactive page: its size against volume and grid, and what a frame costs in a browser without a screen.
+"""Size of the interactive page for several volumes and grids, and time of a frame in a headless browser.
 
-``python benchmarks/page.py [--repeats 15]``: needs Chromium and playwright. Frames are 320 x 240, drawn in software;
-global light, local light and no light at all take turns, so that a busy machine is as unkind to each; medians.
+``python benchmarks/page.py [--repeats 15]`` needs Chromium and playwright. Frames are 320 x 240, drawn in software;
+global light, local light and no light take turns, so that a busy machine affects all alike; times are medians.
 """
 
 import argparse
@@ -28,7 +28,7 @@ FRAME = """(light) => {
 
 
 def scene_of(voxels: int, whole: bool) -> Scene:
-    """Smooth noise, which packs badly: of whole numbers from 0 to 255, or of float32."""
+    """Smooth noise, which compresses badly: integers from 0 to 255, or float32."""
     from scipy.ndimage import gaussian_filter
 
     rough = np.random.default_rng(0).standard_normal((voxels,) * 3)
@@ -39,7 +39,7 @@ def scene_of(voxels: int, whole: bool) -> Scene:
 
 
 def light_of(scene: Scene, nodes: int) -> Illumination:
-    """Light as a run leaves it, as far as size goes: smooth, with 3 % of noise, each channel its own."""
+    """Light whose size is that of a real run: smooth, with 3 % noise, independent in each channel."""
     rng = np.random.default_rng(1)
     spec = GridSpec.over(scene.fields[0].volume, nodes)
     values = 2.0 + np.sin(np.indices(spec.shape) / nodes * 9).sum(axis=0)[..., None] * np.ones(3)
@@ -58,7 +58,7 @@ def sizes() -> None:
 
 
 def opened(chromium: Browser, folder: str, name: str, text: str) -> tuple[Page, float]:
-    """A page that has come to rest, and the seconds until its first picture."""
+    """A page that has finished drawing, and the seconds until its first picture."""
     file = Path(folder) / f"{name}.html"
     file.write_text(text, encoding="utf-8")
     shown = chromium.new_page(viewport={"width": 720, "height": 480})
@@ -77,7 +77,7 @@ def frames(repeats: int) -> None:
         chromium = playwright.chromium.launch(executable_path="/usr/bin/chromium", args=ARGS)
         lit, first = opened(chromium, folder, "lit", text)
         unlit, _ = opened(chromium, folder, "unlit", dark)
-        print(f"\nfirst picture {first:.1f} s after the page was asked for")
+        print(f"\nfirst picture {first:.1f} s after the request")
         kinds = {"global": (lit, "global"), "local": (lit, "local"), "none": (unlit, "global")}
         took: dict[str, list[float]] = {kind: [] for kind in kinds}
         for turn in range(repeats + 1):
@@ -86,7 +86,7 @@ def frames(repeats: int) -> None:
                 if turn:  # the first is a warm-up
                     took[kind].append(milliseconds)
         for kind in kinds:
-            print(f"{kind:7s} {statistics.median(took[kind]):7.1f} ms a frame of 320 x 240")
+            print(f"{kind:7s} {statistics.median(took[kind]):7.1f} ms per frame of 320 x 240")
         for kind in ("local", "none"):
             ratios = [g / other for g, other in zip(took["global"], took[kind])]
             print(f"global / {kind}: {statistics.median(ratios):.3f} (median of {repeats} pairs)")

@@ -1,14 +1,14 @@
-"""How many whole paths a second each backend walks: ``python benchmarks/paths.py [--json FILE]``.
+"""Whole paths per second of each backend: ``python benchmarks/paths.py [--json FILE]``.
 
 open
     A smooth 64³ field, the sum of forty Gaussians, under a sky, 4 bounces: most paths escape soon. No lamps.
 box
-    The same field in the closed box with its luminaire, 6 bounces: every path is as long as it may be, and at each
-    reflection a lamp is asked for its light.
+    The same field in the closed box with its luminaire, 6 bounces: every path has the maximum length, and samples a
+    lamp at each reflection.
 
-Queries are uniform by area on one level set, so that a mesh serves them all; what is built first is timed beside. One
-thread each and then two; the contenders take turns in one process: a rate is the best of the rounds, a ratio the
-median of the ratios within the rounds. `enough` is the number of paths from which a mesh repays its building.
+Queries are uniform by area on one level set, so that one mesh serves them all; its construction is timed separately.
+Each backend runs on one thread and then on two; they take turns in one process. A rate is the best of the rounds, a
+ratio the median of the ratios within the rounds. `enough` is the number of paths at which building a mesh breaks even.
 """
 
 import argparse
@@ -25,7 +25,7 @@ from illumgrid.field.scene import Scene
 from illumgrid.stages import on_level_sets
 
 LEVEL, ROUNDS, QUERIES = 0.4, 5, 2000
-PATHS = {"numba:levelset": 64, "numba:mesh": 64, "embree": 16}  # reference is for reading, some 500 times slower
+PATHS = {"numba:levelset": 64, "numba:mesh": 64, "embree": 16}  # reference is some 500 times slower
 
 
 def timed(work):
@@ -35,7 +35,7 @@ def timed(work):
 
 
 def measure(scene, bounces):
-    """Figures of one scene."""
+    """Measurements for one scene."""
     (queries,) = on_level_sets(scene, [LEVEL], 0, points=QUERIES)
     works = {}
     for name, backend in contenders().items():
@@ -54,7 +54,7 @@ def measure(scene, bounces):
     best = rate["numba:levelset", 1]
     figures = {"mesh to build, seconds": build}
     for name in dict.fromkeys(name for name, _ in works):
-        own = {"paths a second": float(rate[name, 1].max()), "times marching": float(np.median(rate[name, 1] / best))}
+        own = {"paths per second": float(rate[name, 1].max()), "times marching": float(np.median(rate[name, 1] / best))}
         if (name, 2) in rate:
             own["two threads"] = float(np.median(rate[name, 2] / rate[name, 1]))
         figures[name] = own
@@ -65,7 +65,7 @@ def measure(scene, bounces):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--json", help="write the figures here")
+    parser.add_argument("--json", help="file for the measurements")
     asked = parser.parse_args()
     volume = gaussians(64)
     found = {}
@@ -74,12 +74,13 @@ def main():
         ("box", Scene.box(volume, range=(0.2, 0.9)), 6),
     ):
         found[name] = figures = measure(scene, bounces)
-        print(f"{name}: a mesh takes {figures['mesh to build, seconds']:.2f} s and repays after "
+        print(f"{name}: a mesh takes {figures['mesh to build, seconds']:.2f} s and breaks even after "
               f"{figures['enough']:.3g} paths")  # fmt: skip
-        for who, own in figures.items():
+        for backend, own in figures.items():
             if isinstance(own, dict):
                 two = f", two threads {own['two threads']:.2f} times one" if "two threads" in own else ""
-                print(f"  {who:15} {own['paths a second']:10.3g} paths/s, {own['times marching']:.2f} x marching{two}")
+                rate = f"{own['paths per second']:10.3g} paths/s, {own['times marching']:.2f} x marching"
+                print(f"  {backend:15} {rate}{two}")
     if asked.json:
         with open(asked.json, "w") as file:
             json.dump(found, file, indent=2)

@@ -1,8 +1,8 @@
-"""Make the pictures of ``docs/images`` anew: ``python benchmarks/pictures.py FOLDER [--paths N] [--only NAME]``.
+"""Redraw the pictures of ``docs/images``: ``python benchmarks/pictures.py FOLDER [--paths N] [--only NAME]``.
 
-FOLDER holds the volumes, which the project does not keep; each picture's caption names the source of its data. The
-light is computed at a quality for print, minutes each on two cores; the pictures are drawn in software, so that they
-are the same on every machine. ``--keep DIR`` keeps the light, or takes what is there.
+FOLDER holds the volumes, which are not part of the project; each picture's caption names the source of its data. The
+light has print quality and takes minutes per picture on two cores. The pictures are drawn in software, so that they are
+the same on every machine. ``--keep DIR`` stores the light in DIR, or reads it from there if it exists.
 """
 
 import argparse
@@ -44,8 +44,8 @@ def brain(folder):
 
 
 def neuron(folder):
-    """A neuron over a floor, under a lamp: shadows say how high each branch runs."""
-    whole = ig.read_volume(folder / "rivulet_neuron.nrrd")  # its middle: two thin arms lead far out
+    """A neuron over a floor, under a lamp: shadows show how high each branch runs."""
+    whole = ig.read_volume(folder / "rivulet_neuron.nrrd")  # crop to the middle: two thin arms extend far outwards
     volume = smooth(ig.Volume(whole.values[45:195, 80:335, :105], spacing=whole.spacing), 1.0)
     scene = ig.Scene.floor(volume, albedo=(0.8, 0.62, 0.3), range=(10, 40))
     floor = replace(scene.quads[0], texels=(160, 160))

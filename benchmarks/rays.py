@@ -1,18 +1,18 @@
-"""How many rays a second find what they hit: ``python benchmarks/rays.py [--json FILE]``.
+"""Ray intersections per second: ``python benchmarks/rays.py [--json FILE]``.
 
-The same rays in one run, in random order and sorted by origin, against the marching-cubes mesh of a level set (`bvh`,
-and `embreex` where it is installed) and through its trilinear field (`marching`):
+The same rays, in random order and sorted by origin, are intersected in one run with the marching-cubes mesh of a level
+set (`bvh`, and `embreex` if installed) and with its trilinear field (`marching`):
 
 surface
     Cosine-distributed rays from points on one level set of a smooth 128³ field, the sum of forty Gaussians: 140,000
-    triangles. One ray in eighteen hits something, but most pass many triangles closely.
+    triangles. One ray in eighteen hits something, but most pass close to many triangles.
 cavity
     Rays in all directions from inside the sealed caves of a 64³ field of noise, 150,000 triangles: all hit something.
 
-One thread each, then two against one, beside a bare loop that shows what the machine has to give just then. The
-contenders take turns, so that whatever else the machine does meets all of them alike: a rate is the best of nine rounds
-of thread time, a ratio the median of the ratios within the rounds, of wall clock where it is about two threads. What
-they build first is timed as well, the best of three, in processor seconds: of embreex all threads together.
+Each method runs on one thread, then on two, beside a bare loop that shows the current speed of the machine. The methods
+take turns, so that other load affects all alike. A rate is the best of nine rounds in thread time; a ratio is the
+median of the ratios within the rounds, in wall time for two threads. Setup is timed as well: the best of three, in
+processor seconds (for embreex, summed over its threads).
 """
 
 import argparse
@@ -34,11 +34,11 @@ from illumgrid.transport.samples import in_frame
 
 RAYS, ROUNDS = 200_000, 9
 ISOVALUE, WALL = 0.4, 0.31
-OFF = 0.01  # voxels: where rays that leave a surface start, for those who only know the mesh
+OFF = 0.01  # voxels: offset of rays that leave a surface, for methods that only have the mesh
 
 
 def gaussians(voxels=128, count=40, seed=1):
-    """Sum of `count` Gaussians of random place and width on -1 to 1."""
+    """Sum of `count` Gaussians of random position and width on [-1, 1]³."""
     random = np.random.default_rng(seed)
     axis = np.linspace(-1, 1, voxels)
     values = np.zeros((voxels, voxels, voxels))
@@ -50,13 +50,13 @@ def gaussians(voxels=128, count=40, seed=1):
 
 
 def caves(voxels=64, seed=3):
-    """Smooth noise in a shell of solid: every cave in it is sealed."""
+    """Smooth noise in a solid shell: every cave in it is sealed."""
     noise = gaussian_filter(np.random.default_rng(seed).normal(size=(voxels, voxels, voxels)), 2.5)
     return Volume(np.pad(noise / noise.std(), 1, constant_values=9.0))
 
 
 def rays_from(scene, mesh, seed=2):
-    """Points on the level set, and cosine directions about their normals."""
+    """Points on the level set, and cosine-distributed directions about their normals."""
     random = np.random.default_rng(seed)
     queries = Queries.at(scene, mesh.vertices[random.integers(0, len(mesh.vertices), RAYS)], level=ISOVALUE)
     point, normal, _ = in_frame(scene, queries)
@@ -65,7 +65,7 @@ def rays_from(scene, mesh, seed=2):
 
 
 def rays_inside(volume, seed=9):
-    """Voxels in the caves, away from the wall, and directions all around."""
+    """Voxels in the caves, away from the wall, and directions uniform on the sphere."""
     random = np.random.default_rng(seed)
     inside = np.argwhere(volume.values < 0.0).astype(float)
     return inside[random.integers(len(inside), size=RAYS)], directions(random)
@@ -78,7 +78,7 @@ def directions(random):
 
 
 def race(contenders, rounds=ROUNDS, clock=time.thread_time):
-    """Seconds (rounds, contenders): they take turns, after one round to warm up."""
+    """Seconds (rounds, contenders), which take turns, after one warm-up round."""
     seconds = []
     for _ in range(rounds + 1):
         seconds.append([])
@@ -90,7 +90,7 @@ def race(contenders, rounds=ROUNDS, clock=time.thread_time):
 
 
 def embree_scene(mesh):
-    """Scene of embreex, its tree built, which the first ray causes."""
+    """Scene of embreex with its tree, which the first ray builds."""
     from embreex.mesh_construction import TriangleMesh
     from embreex.rtcore_scene import EmbreeScene
 
@@ -102,14 +102,14 @@ def embree_scene(mesh):
 
 @numba.njit(nogil=True, error_model="numpy", _nrt=False)
 def march_rays(fields, level, origin, direction, on, t):
-    """Distances through the field, without normals: nor do the others give any."""
+    """Distances through the field, without normals, which the other methods do not compute either."""
     for i in range(len(origin)):
         x, d = (origin[i, 0], origin[i, 1], origin[i, 2]), (direction[i, 0], direction[i, 1], direction[i, 2])
         t[i] = nearest_hit(fields, level, x, (0.0, 0.0, 0.0), d, on, NOWHERE)[0]
 
 
 def contenders(fields, tree, embree, level, on, origin, direction):
-    """How each casts these rays, and the distances it fills; `on` is 0 where rays leave the surface, else -1."""
+    """Calls that cast these rays, and the distances they fill; `on` is 0 where rays leave the surface, else -1."""
     n = len(origin)
     start = origin + OFF * direction if on >= 0 else origin
     along_mesh, along_field = np.zeros(n), np.zeros(n)
@@ -128,9 +128,9 @@ def contenders(fields, tree, embree, level, on, origin, direction):
 
 
 def one_thread(work, distances):
-    """Rate, ratio to embreex and share of hits of each."""
+    """Rate, ratio to embreex and share of hits of each method."""
     seconds = dict(zip(work, race(work.values()).T))
-    figures = {name: {"million rays a second": RAYS / spent.min() / 1e6} for name, spent in seconds.items()}
+    figures = {name: {"million rays per second": RAYS / spent.min() / 1e6} for name, spent in seconds.items()}
     for name, spent in seconds.items():
         if "embreex" in seconds:
             figures[name]["times embreex"] = float(np.median(seconds["embreex"] / spent))
@@ -149,7 +149,7 @@ def bare_loop(count):
 
 
 def two_threads(halves):
-    """How many times faster two threads cast both halves than one, by the clock on the wall."""
+    """Speedup of two threads over one for casting both halves, in wall time."""
     pairs = {name: [half[name] for half in halves] for name in halves[0]}
     pairs["bare loop"] = [partial(bare_loop, 10_000_000)] * 2
     with ThreadPoolExecutor(2) as pool:
@@ -167,7 +167,7 @@ def two_threads(halves):
 
 
 def measure(scene, mesh, level, on, origin, direction):
-    """All figures of one scene."""
+    """All measurements for one scene."""
     volume = scene.fields[0].volume
     builds = {
         "bricks": partial(marchable, scene),
@@ -190,21 +190,21 @@ def measure(scene, mesh, level, on, origin, direction):
 
 
 def show(scene, figures):
-    """Print the figures of one scene."""
+    """Print the measurements for one scene."""
     print(f"{scene}: {figures['triangles']} triangles, {RAYS} rays")
     print(f"  {'':26} {'Mrays/s':>8} {'x embreex':>10} {'hit':>8}")
     for order in ("random", "sorted"):
-        for who, found in figures[order].items():
+        for name, found in figures[order].items():
             ratio = f"{found['times embreex']:10.2f}" if "times embreex" in found else " " * 10
             hit = f"{found['hit']:8.2%}" if "hit" in found else ""
-            print(f"  {order + ', ' + who:26} {found['million rays a second']:8.2f} {ratio} {hit}")
-    print("  two threads over one:      " + ", ".join(f"{who} {f:.2f}" for who, f in figures["two threads"].items()))
-    print("  to build, CPU seconds:     " + ", ".join(f"{who} {f:.3f}" for who, f in figures["build"].items()))
+            print(f"  {order + ', ' + name:26} {found['million rays per second']:8.2f} {ratio} {hit}")
+    print("  two threads over one:      " + ", ".join(f"{name} {f:.2f}" for name, f in figures["two threads"].items()))
+    print("  setup, CPU seconds:        " + ", ".join(f"{name} {f:.3f}" for name, f in figures["build"].items()))
 
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--json", help="write the figures here")
+    parser.add_argument("--json", help="file for the measurements")
     asked = parser.parse_args()
     figures = {}
 

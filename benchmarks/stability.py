@@ -1,7 +1,7 @@
-"""Where methods fail: the error of every method against the parameter that breaks it.
+"""Where methods fail: error of every method against parameters that break it.
 
-``python benchmarks/stability.py`` measures (some minutes on two cores) and writes the figure and the numbers of
-the page "Where methods fail" into docs/images; ``--only noise`` measures one curve and prints it.
+``python benchmarks/stability.py`` measures for some minutes on two cores and writes the figure and the table of the
+page "Where methods fail" into docs/images; ``--only noise`` measures one curve and prints it.
 """
 
 import argparse
@@ -31,7 +31,7 @@ N = 28
 
 
 def hills(n: int = N, seed: int = 0, noise: float = 0.0, flatten: float = 1.0, stretch: float = 1.0) -> Volume:
-    """A sum of Gaussians in the unit cube and white noise; with `stretch` fewer, longer voxels along z."""
+    """A sum of Gaussians in the unit cube plus white noise; `stretch` makes voxels along z fewer and longer."""
     random = np.random.default_rng(seed)
     shape = np.array([n, n, max(2, round((n - 1) / stretch) + 1)])
     step = 1 / (shape - 1)
@@ -50,7 +50,7 @@ def sky(volume: Volume, low: float = 0.15, high: float = 0.75) -> Scene:
 
 
 def sheet(nodes: float) -> Scene:
-    """A plate of so many node spacings, lit from above; below it is a black floor."""
+    """A plate, `nodes` node spacings thick, lit from above; below it is a black floor."""
     x = (np.stack(np.indices((N, N, N)), axis=-1) - N // 2) / (N / 2)  # a plane of voxels lies in the plate
     depth = np.maximum(np.abs(x[..., 2]) - nodes / N, np.abs(x[..., :2]).max(axis=-1) - 0.8)
     scene = Scene.floor(Volume(-depth), range=(-0.3 * nodes / N, 0.3 * nodes / N))
@@ -58,20 +58,20 @@ def sheet(nodes: float) -> Scene:
 
 
 def pair() -> Scene:
-    """Two balls that melt into one at isovalue 0.7."""
+    """Two balls that merge at isovalue 0.7."""
     x = (np.stack(np.indices((44, N, N)), axis=-1) - [21.5, 13.5, 13.5]) / 13.5
     distance = [np.linalg.norm(x - [side * 0.5, 0, 0], axis=-1) for side in (-1, 1)]
     return Scene.sky(Volume(1.2 - np.minimum(*distance)), range=(0.5, 0.9))
 
 
 def power(p: float) -> Scene:
-    """1 - r^p: the gradient vanishes towards the middle, the faster the larger p."""
+    """1 - r^p: the gradient vanishes towards the centre, faster for larger p."""
     x = (np.stack(np.indices((N, N, N)), axis=-1) - (N - 1) / 2) / (N / 2)
     return Scene.sky(Volume(1 - np.linalg.norm(x, axis=-1) ** p), range=(0.2, 0.98))
 
 
 def lit(scene: Scene, method: str, levels: int = 12, paths: int = 32, grid: int | None = None) -> "ig.Illumination":
-    """The light of a scene by one of the methods."""
+    """The light of a scene, by one of the methods."""
     sampler, interpolator = METHODS[method]
     options = {} if sampler == "direct" else {"count": levels}
     return ig.run(
@@ -81,7 +81,7 @@ def lit(scene: Scene, method: str, levels: int = 12, paths: int = 32, grid: int 
 
 
 def judged(scene: Scene, grids: dict[str, "ig.Illumination"]) -> dict[str, float]:
-    """Relative RMSE of each at points on isovalues that nobody visited."""
+    """Relative RMSE of each method at points on isovalues that no method visited."""
     backend = ig.backend("numba")
     asked = unseen_on_level_sets(scene, 10, 400, 7)
     truth = converge(begin(scene, backend, asked, 3, 7), scene, backend, 7, 0.005, 512)
@@ -89,21 +89,21 @@ def judged(scene: Scene, grids: dict[str, "ig.Illumination"]) -> dict[str, float
 
 
 def swept(values: list[float], make: Callable[[float], Scene]) -> Iterator[tuple[float, dict[str, float]]]:
-    """A scene for each value of the parameter, judged for all methods."""
+    """Errors of all methods for each value of a parameter of the scene."""
     for value in values:
         scene = make(value)
         yield value, judged(scene, {name: lit(scene, name) for name in METHODS})
 
 
 def by_levels() -> Iterator[tuple[float, dict[str, float]]]:
-    """The number of isovalues that are visited."""
+    """Errors against the number of isovalues that the sampler visits."""
     scene = sky(hills())
     for count in (2, 4, 8, 16, 32, 64):
         yield count, judged(scene, {name: lit(scene, name, levels=count) for name in METHODS})
 
 
 def by_nodes() -> Iterator[tuple[float, dict[str, float]]]:
-    """Nodes to a voxel."""
+    """Errors against nodes per voxel."""
     scene = sky(hills())
     for share in (0.25, 0.5, 1.0, 2.0):
         grid = round(share * (N - 1)) + 1
@@ -111,14 +111,14 @@ def by_nodes() -> Iterator[tuple[float, dict[str, float]]]:
 
 
 def by_paths() -> Iterator[tuple[float, dict[str, float]]]:
-    """Paths to a query."""
+    """Errors against paths per query."""
     scene = sky(hills())
     for paths in (1, 2, 4, 16, 64, 256):
         yield paths, judged(scene, {name: lit(scene, name, paths=paths) for name in METHODS})
 
 
 def by_distance() -> Iterator[tuple[float, dict[str, float]]]:
-    """Distance of the isovalue from a critical one, on either side."""
+    """Errors against the distance of the isovalue from a critical one, on both sides."""
     scene = pair()
     grids = {name: lit(scene, name) for name in METHODS}
     backend = ig.backend("numba")
@@ -146,19 +146,19 @@ CURVES: dict[str, tuple[str, Callable[[], Iterator[tuple[float, dict[str, float]
     "gradient": ("exponent p of 1 - r^p", lambda: swept([1, 2, 4, 8, 16], power)),
     "critical": ("distance from a critical isovalue", by_distance),
     "levels": ("isovalues visited", by_levels),
-    "nodes": ("nodes to a voxel", by_nodes),
-    "paths": ("paths to a query", by_paths),
+    "nodes": ("nodes per voxel", by_nodes),
+    "paths": ("paths per query", by_paths),
 }  # fmt: skip
 
 
 def draw(measured: dict[str, list[tuple[float, dict[str, float]]]]) -> None:
-    """One panel a curve."""
+    """One panel per curve."""
     import matplotlib.pyplot as plt
 
     figure, panels = plt.subplots(2, 4, figsize=(14, 6.4), layout="constrained", sharey=True)
     for panel, (name, points) in zip(panels.flat, measured.items()):
         for method, marker in zip(METHODS, "osD^v"):
-            error = [y[method] or np.nan for _, y in points]  # below the truth's own error nothing is seen
+            error = [y[method] or np.nan for _, y in points]  # errors below that of the reference are not resolved
             panel.plot([x for x, _ in points], error, f"-{marker}", label=method, ms=4, lw=1)
         panel.set(xscale="log", yscale="log", xlabel=CURVES[name][0], title=name)
         panel.set_xticks([x for x, _ in points], [f"{x:g}" for x, _ in points])
@@ -171,7 +171,7 @@ def draw(measured: dict[str, list[tuple[float, dict[str, float]]]]) -> None:
 
 
 def table(measured: dict[str, list[tuple[float, dict[str, float]]]]) -> str:
-    """The numbers as the page includes them."""
+    """The table that the page includes."""
     lines = ["| parameter | value | " + " | ".join(METHODS) + " |", "|---" * (2 + len(METHODS)) + "|"]
     for name, points in measured.items():
         for value, result in points:
@@ -183,7 +183,7 @@ def main() -> None:
     """Measure the curves."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--only", choices=list(CURVES))
-    parser.add_argument("--redraw", action="store_true", help="figure and table from the numbers that are there")
+    parser.add_argument("--redraw", action="store_true", help="figure and table from docs/images/stability.json")
     asked = parser.parse_args()
     warnings.simplefilter("ignore")
     measured: dict[str, list[tuple[float, dict[str, float]]]] = {}
