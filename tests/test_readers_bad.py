@@ -25,7 +25,8 @@ WRITERS = ["nrrd", "nii", "mha", "mrc", "vtk", "gipl", "tif", "dcm", "h5", "npy"
 
 @pytest.mark.parametrize("ending", ["nrrd", "nii", "mha", "npy", "npz"])
 def test_wrong_number_of_axes(tmp_path, ending):
-    for shape, words in [((4, 5), ("2 axes (4x5)", "stack")), ((4, 5, 6, 3), ("4 axes (4x5x6x3)", "time step"))]:
+    many = ("4 axes (4x5x6x3)",) if ending in ("npy", "npz") else ("3 time steps: 0, 1, 2",)
+    for shape, words in [((4, 5), ("2 axes (4x5)", "stack")), ((4, 5, 6, 3), (*many, "--time N"))]:
         file = tmp_path / f"a.{ending}"
         array = values("float32", shape)
         if ending == "npy":
@@ -41,10 +42,10 @@ def test_wrong_number_of_axes(tmp_path, ending):
 def test_wrong_voxels(tmp_path, ending):
     file = tmp_path / f"a.{ending}"
     sitk.WriteImage(sitk.GetImageFromArray(values(shape=(3, 4, 5, 3)), isVector=True), str(file))
-    refused(file, "vector", "one channel")
+    refused(file, *(("holds 3 channels: 0, 1, 2", "--channel N") if ending != "tif" else ("one channel",)))
     if ending != "tif":
         sitk.WriteImage(sitk.GetImageFromArray(values("complex64").T), str(file))
-        refused(file, "magnitude")
+        refused(file, "2 channels" if ending == "mha" else "magnitude")  # a MetaImage does not say what they are
     if ending in ("nrrd", "mha"):  # the others drop a last axis of 1
         sitk.WriteImage(sitk.GetImageFromArray(values(shape=(1, 4, 5))), str(file))
         refused(file, "expected at least 2")

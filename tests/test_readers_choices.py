@@ -50,7 +50,7 @@ def test_several_are_listed_with_the_option_that_chooses():
     with pytest.raises(BadInput, match="holds 2 channels: 0 DAPI, 1 GFP; expected one; choose it with --channel N"):
         pick(None, "channel", ["DAPI", "GFP"])
     assert pick("GFP", "channel", ["DAPI", "GFP"]) == pick("1", "channel", ["DAPI", "GFP"]) == 1
-    with pytest.raises(BadInput, match="--time is .2.; expected one of its time steps: 0, 1"):
+    with pytest.raises(BadInput, match=r"--time is .2.; expected one of its time steps: 0, 1"):
         pick(2, "time", ["", ""])
 
 

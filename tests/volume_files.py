@@ -56,11 +56,12 @@ def refused_lightly(path, *words):
 
 
 def nrrd_head(encoding, more="", kind="uint8"):
-    return f"NRRD0004\ntype: {kind}\ndimension: 3\nsizes: 5 6 7\nendian: little\nencoding: {encoding}\n{more}".encode()
+    return f"NRRD0004\ntype: {kind}\ndimension: 3\nsizes: 5 6 7\nspacings: 1 1 1\nendian: little\nencoding: {encoding}\n{more}".encode()
 
 
 def meta_head(data, more="", size="5 6 7"):
-    start = f"ObjectType = Image\nNDims = 3\nDimSize = {size}\nElementType = MET_UCHAR\n"
+    start = f"ObjectType = Image\nNDims = 3\nDimSize = {size}\nElementSpacing = 1 1 1\n"
+    start += "ElementType = MET_UCHAR\n"
     return f"{start}{more}ElementDataFile = {data}\n".encode()
 
 

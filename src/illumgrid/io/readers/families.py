@@ -34,15 +34,15 @@ FAMILIES = (
         starts=((0, b"II*\0"), (0, b"MM\0*"), (0, b"II+\0"), (0, b"MM\0+")),
         chooses=("channel", "time", "array"),
     ),
-    Family("NRRD", "itk", (".nrrd", ".nhdr"), ((0, b"NRRD000"),), ("channel", "time"), True),
+    Family("NRRD", "nrrd", (".nrrd", ".nhdr"), ((0, b"NRRD000"),), ("channel", "time"), True),
     Family(
-        *("NIfTI", "itk", (".nii", ".hdr", ".img")),
+        *("NIfTI", "nifti", (".nii", ".hdr", ".img")),
         starts=((344, b"n+1\0"), (344, b"ni1\0"), (4, b"n+2\0\r\n"), (4, b"ni2\0\r\n")),
         chooses=("channel", "time"),
         medical=True,
     ),
     Family(
-        *("MetaImage", "itk", (".mha", ".mhd")),
+        *("MetaImage", "meta", (".mha", ".mhd")),
         starts=((0, b"ObjectType"), (0, b"NDims")),
         chooses=("channel", "time"),
         medical=True,

@@ -9,7 +9,7 @@ import stat
 import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import IO, Any, Literal
 
@@ -53,6 +53,10 @@ class Source:
     def most(self) -> int:
         """Bytes that the unpacked file can have at most."""
         return self.size * DEFLATE if self.packed else self.size
+
+    def most_inside(self, packing: Packing) -> int:
+        """Bytes that a part of this packing can have at most, unpacked; packing what is packed gains nothing."""
+        return self.most if packing == "raw" else self.size * (1 << 16 if packing == "bzip2" else DEFLATE)
 
 
 def open_regular(file: Path) -> IO[bytes]:
@@ -105,7 +109,10 @@ def seekable(source: Source) -> Iterator[IO[bytes]]:
 
 
 def beside(source: Source, named: str) -> Source:
-    """A file that a header names, in the folder of the header or below it; no other place is looked at."""
+    """A file that a header names, in the folder of the header or below it; no other place is looked at.
+
+    It is taken as it is: whether it is packed the header says.
+    """
     folder = source.file.parent
     if not named or "\0" in named:
         raise BadInput(f"its header names the data file {named!r}; expected a file beside it; mend the header")
@@ -128,7 +135,7 @@ def beside(source: Source, named: str) -> Source:
                 f"its data file {named} is a link to a place outside the folder of the header; expected a file beside "
                 "it; copy the data there"
             )
-        return find_source(place)
+        return replace(find_source(place), packed=False)
     except OSError as problem:
         raise BadInput(
             f"its data file {named} cannot be read ({problem.strerror}); check its name and rights"
@@ -210,11 +217,11 @@ def read_text(stream: IO[bytes], count: int) -> NDArray[np.float64]:
 
 
 def finish(stream: IO[bytes], spare: int = CHUNK) -> int:
-    """Read what follows the data, so that the checksum at the end is verified; how many bytes that were.
+    """Read what follows the data, so that the checksum at the end is verified; how many bytes that were (padding: 0).
 
     More than `spare` bytes are refused: the header does not say what they are.
     """
-    more = len(stream.read(spare + 1))
-    if more > spare:
+    more = stream.read(spare + 1)
+    if len(more) > spare:
         raise BadInput(f"has more data than its header promises; {AGAIN}")
-    return more
+    return len(more) if more.strip(b"\0") else 0

@@ -39,6 +39,8 @@ class Stored:
     """(3, 3): column i is the world vector from a voxel to its neighbour along axis i; it may shear."""
     slope: float = 1.0
     intercept: float = 0.0
+    spacing: Floats | None = None
+    """(3,) lengths of the steps, where the header says them with more digits than the steps have."""
     unit: str | None = None
     """Of the world coordinates: "mm", "µm", "Å"."""
     notes: tuple[Note, ...] = ()
@@ -98,8 +100,9 @@ def downsample(stored: Stored, factor: int) -> Stored:
         total += stored.values[tuple(slice(o, o + n * factor, factor) for o, n in zip(offset, blocks))]
     total /= factor**3
     values = total if stored.values.dtype == np.float64 else total.astype(np.float32)
-    centre = np.full(3, (factor - 1) / 2)
-    return replace(stored, values=values, origin=stored.origin + stored.steps @ centre, steps=stored.steps * factor)
+    origin = stored.origin + stored.steps @ np.full(3, (factor - 1) / 2)
+    spacing = None if stored.spacing is None else stored.spacing * factor
+    return replace(stored, values=values, origin=origin, steps=stored.steps * factor, spacing=spacing)
 
 
 def with_spacing(stored: Stored, spacing: Sequence[float]) -> Stored:
@@ -108,7 +111,7 @@ def with_spacing(stored: Stored, spacing: Sequence[float]) -> Stored:
     if step.shape != (3,) or not np.isfinite(step).all() or not (step > 0).all():
         raise BadInput(f"--spacing is {' '.join(map(str, np.ravel(spacing)))}; expected three positive numbers: X Y Z")
     notes = tuple(note for note in stored.notes if note[0] != "spacing")
-    return replace(stored, steps=stored.steps / np.linalg.norm(stored.steps, axis=0) * step, notes=notes)
+    return replace(stored, steps=stored.steps / np.linalg.norm(stored.steps, axis=0) * step, spacing=step, notes=notes)
 
 
 SKEW = 0.005
@@ -127,6 +130,8 @@ def place(stored: Stored) -> tuple[Volume, tuple[Note, ...]]:
         )
     if abs(np.linalg.det(stored.steps / spacing)) < 1e-3:
         raise BadInput(f"its axes are {stored.steps.T.tolist()}; expected three different directions; mend its header")
+    if stored.spacing is not None and np.allclose(stored.spacing, spacing, rtol=1e-5, atol=0):
+        spacing = stored.spacing
     direction = stored.steps / spacing
     notes = stored.notes
     skew = float(np.abs(direction.T @ direction - np.eye(3)).max())
@@ -182,4 +187,4 @@ def unsheared(stored: Stored) -> Stored:
         old = np.tensordot(back, np.stack([i, j, np.full(i.shape, k + low[2])]).astype(float), 1)
         old = np.where(np.abs(old - np.round(old)) < 1e-6, np.round(old), old)
         out[:, :, k] = map_coordinates(values, old, order=1, mode="constant", cval=np.nan)
-    return replace(stored, values=out, origin=stored.origin + q @ (step * low), steps=q * step)
+    return replace(stored, values=out, origin=stored.origin + q @ (step * low), steps=q * step, spacing=step)
