@@ -56,7 +56,8 @@ def refused_lightly(path, *words):
 
 
 def nrrd_head(encoding, more="", kind="uint8"):
-    return f"NRRD0004\ntype: {kind}\ndimension: 3\nsizes: 5 6 7\nspacings: 1 1 1\nendian: little\nencoding: {encoding}\n{more}".encode()
+    start = f"NRRD0004\ntype: {kind}\ndimension: 3\nsizes: 5 6 7\nspacings: 1 1 1\n"
+    return f"{start}endian: little\nencoding: {encoding}\n{more}".encode()
 
 
 def meta_head(data, more="", size="5 6 7"):

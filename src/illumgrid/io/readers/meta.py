@@ -22,10 +22,10 @@ from illumgrid.io.readers.source import Packing, Source, beside, finish, inflate
 from illumgrid.io.readers.stored import Note, Stored, Wanted, pick
 
 TYPES = {
-    **{"MET_CHAR": "i1", "MET_UCHAR": "u1", "MET_SHORT": "i2", "MET_USHORT": "u2", "MET_INT": "i4", "MET_UINT": "u4"},
-    **{"MET_LONG": "i4", "MET_ULONG": "u4", "MET_LONG_LONG": "i8", "MET_ULONG_LONG": "u8"},
-    **{"MET_FLOAT": "f4", "MET_DOUBLE": "f8"},
-}
+    "MET_CHAR": "i1", "MET_UCHAR": "u1", "MET_SHORT": "i2", "MET_USHORT": "u2", "MET_INT": "i4", "MET_UINT": "u4",
+    "MET_LONG": "i4", "MET_ULONG": "u4", "MET_LONG_LONG": "i8", "MET_ULONG_LONG": "u8",
+    "MET_FLOAT": "f4", "MET_DOUBLE": "f8",
+}  # fmt: skip
 """NumPy's names of the element types; MetaIO's MET_LONG has 4 bytes."""
 
 LONGEST = 1 << 16
@@ -70,7 +70,7 @@ def _header(stream: IO[bytes]) -> tuple[Fields, list[str]]:
     while "ElementDataFile" not in fields:
         line = stream.readline(LONGEST)
         key, equals, value = line.decode("utf-8", "surrogateescape").partition("=")
-        if not equals and line.strip() or len(line) == LONGEST or len(fields) > 1000:
+        if (not equals and line.strip()) or len(line) == LONGEST or len(fields) > 1000:
             raise BadInput("its header has a line that is not KEY = VALUE; expected a MetaImage header; mend it")
         if not line:
             raise BadInput("its header ends without ElementDataFile; expected where its data are; mend the header")

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from illumgrid.errors import BadInput
 from illumgrid.io.readers.limits import CHUNK, check_axes, check_size
-from illumgrid.io.readers.source import Source, finish, find_source, opened, read_array
+from illumgrid.io.readers.source import Source, find_source, finish, opened, read_array
 from illumgrid.io.readers.stored import Note, Stored, Wanted, pick
 
 TO_LPS = np.diag([-1.0, -1.0, 1.0])
@@ -97,6 +97,7 @@ def _header(stream: IO[bytes]) -> Any:
     """NIfTI-1, NIfTI-2 or Analyze, in either byte order."""
     import nibabel
 
+    kind: Any
     start = stream.read(4)
     sizes = {int.from_bytes(start, order) for order in ("little", "big")}
     if 540 in sizes:
@@ -113,7 +114,7 @@ def _header(stream: IO[bytes]) -> Any:
     if length == 348 and block[344:348] not in (b"n+1\0", b"ni1\0"):
         kind = nibabel.Spm99AnalyzeHeader
     try:
-        header = kind(block, check=False)
+        header: Any = kind(block, check=False)
         header.check_fix(error_level=40)
     except nibabel.spatialimages.HeaderDataError as problem:
         raise BadInput(f"its header is not that of a NIfTI file ({problem}); expected a valid one; mend it") from None
