@@ -245,8 +245,9 @@ def test_a_path_that_starts_inside_another_solid_is_worth_nothing():
     point, normal = (2.5, 3.0, 2.0), (-1.0, 0.0, 0.0)
     for path in range(5):
         key = np.uint64(7)
-        start = (levels, 0, kernels.NOWHERE, point, normal)
-        assert kernels.walk(marchable(scene), key, np.uint64(path), 4, *start) == (0, 0, 0)
+        start, light = (levels, 0, kernels.NOWHERE, point, normal), np.ones(3)
+        kernels.walk(marchable(scene), key, np.uint64(path), 4, *start, np.ones(3), light)
+        assert not light.any()
 
 
 @pytest.mark.parametrize("d", [(1, 1, 1), (-1, 1, -1), (0, 0, 1), (0, -1, 0)])

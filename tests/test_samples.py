@@ -1,12 +1,16 @@
 """Queries: each on the level set of its own row. Samples: answers with honest errors."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 import illumgrid as ig
 from illumgrid.field.scene import Field, Scene
 from illumgrid.field.volume import Volume, interpolate, world_to_index
+from illumgrid.grid.channels import GREY, RGB, Channels
 from illumgrid.transport import samples as samples_of
+from illumgrid.transport import tracer
 from illumgrid.transport.samples import Queries, Samples, check_request, combine, join_queries, join_samples
 from shapes import DIRECTIONS, MIRRORED, ball, refused, sampled, sky
 
@@ -214,6 +218,58 @@ def test_samples_are_cut_and_joined():
     for name in ("mean", "m2", "paths"):
         assert np.array_equal(getattr(again, name), getattr(samples, name))
     assert np.array_equal(again.queries.id, queries.id)
+
+
+# Channels
+
+
+@pytest.mark.parametrize(
+    "stage, options", [("numba", {}), ("numba", {"surface": "mesh"}), ("reference", {}), ("embree", {})]
+)
+def test_a_grey_scene_takes_one_channel_whose_rgb_is_what_three_would_be(stage, options, monkeypatch):
+    if stage == "embree":
+        pytest.importorskip("embreex")
+    backend = ig.backend(stage, **options)
+    scene = Scene(sky().fields, Scene.floor(sky().fields[0].volume).quads, np.full(3, 0.5))
+    asked = Queries.at(scene, shell(20), level=0.5)
+    request = {"paths": range(12), "bounces": 2, "seed": 1}
+    grey = backend.solve(scene, asked, **request)
+    assert grey.channels == GREY and grey.light.shape == grey.spread.shape == (20, 1) and grey.paths.any()
+    monkeypatch.setattr(tracer, "channels_of", lambda scene: RGB)
+    colored = backend.solve(scene, asked, **request)
+    assert colored.channels == RGB and colored.light.shape == (20, 3)
+    for name in ("mean", "m2", "stderr", "error"):
+        assert np.array_equal(getattr(grey, name), getattr(colored, name))
+
+
+def test_channels_are_inferred_from_the_arrays_and_survive_cuts_and_replacements():
+    queries, paths = Queries.at(sky(), shell(4)), np.full(4, 8, np.int32)
+    light = np.random.default_rng(0).random((4, 3)).astype(np.float32)
+    rgb = Samples(queries, light, m2=light, paths=paths)
+    assert rgb.channels == RGB and np.shares_memory(rgb.mean, light)
+    grey = Samples(queries, light[:, :1], light[:, 1:2], paths)
+    assert grey.channels == GREY and grey.mean.shape == grey.m2.shape == (4, 3)
+    with pytest.raises(ValueError, match="read-only"):
+        grey.mean[0] = 1
+    cut = join_samples([grey[:2], replace(grey, paths=2 * paths)[2:]])
+    assert cut.channels == GREY and cut.light.nbytes == 16 and cut.paths.tolist() == [8, 8, 16, 16]
+    assert np.array_equal(cut.mean, grey.mean)
+    changed = replace(grey, mean=2 * light)
+    assert changed.channels == RGB and np.array_equal(changed.mean, 2 * light)
+    two = Channels(("key", "dome"), ((1.0, 1.0, 1.0), (0.5, 0.0, 0.0)))
+    mixed = Samples(queries, light[:, :2], light[:, :2], paths, channels=two)
+    np.testing.assert_allclose(mixed.mean[:, 0], light[:, 0] + 0.5 * light[:, 1], rtol=1e-6)
+
+
+def test_grey_and_coloured_answers_combine_to_coloured_ones():
+    queries, paths = Queries.at(sky(), shell(4)), np.full(4, 8, np.int32)
+    light = np.random.default_rng(0).random((4, 3)).astype(np.float32)
+    grey, rgb = Samples(queries, light[:, :1], light[:, :1], paths), Samples(queries, light, light, paths)
+    flat = Samples(queries, grey.mean.copy(), grey.m2.copy(), paths)
+    for put_together in (combine, lambda *parts: join_samples(parts)):
+        both, expected = put_together(grey, rgb), put_together(flat, rgb)
+        assert both.channels == RGB
+        assert np.array_equal(both.mean, expected.mean) and np.array_equal(both.m2, expected.m2)
 
 
 @pytest.mark.parametrize("paths", [range(0, 8, 2), range(8, 0, -1), range(-1, 4), 8, [0, 1]])

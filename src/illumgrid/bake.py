@@ -13,6 +13,7 @@ from illumgrid.errors import BadInput
 from illumgrid.field.scene import Levels, Quad, Scene
 from illumgrid.field.volume import interpolate, world_to_index
 from illumgrid.grid import GridSpec, IlluminationGrid, Nodes, WallTexture, fill_holes
+from illumgrid.grid.channels import Channels
 from illumgrid.samplers.direct import Direct, reachable
 from illumgrid.stages import Backend, Interpolator, Sampler
 from illumgrid.transport.samples import Queries, Samples, combine, join_queries, join_samples
@@ -31,7 +32,6 @@ class Map(Protocol):
 
 
 QUERY_ARRAYS = tuple(f.name for f in fields(Queries))
-SAMPLE_ARRAYS = tuple(f.name for f in fields(Samples) if f.name != "queries")
 
 
 def shifted_seed(seed: int, shift: int) -> int:
@@ -115,7 +115,9 @@ class Bake:
         queries = join_queries(self.targets)
         arrays = {name: getattr(queries, name) for name in QUERY_ARRAYS}
         if self.answers:
-            arrays |= {name: getattr(self.samples, name) for name in SAMPLE_ARRAYS}
+            samples, channels = self.samples, self.samples.channels
+            arrays |= {"light": samples.light, "spread": samples.spread, "paths": samples.paths}
+            arrays |= {"channels": np.array(channels.names), "mix": np.array(channels.mix)}
         return arrays | {
             "batches": np.array([len(q) for q in self.targets]),
             "weights": np.array(self.weights),
@@ -132,7 +134,8 @@ class Bake:
         rows = [slice(a, b) for a, b in zip([0, *ends], ends)]
         answers: tuple[Samples, ...] = ()
         if len(arrays["walked"]):
-            whole = Samples(queries, *(arrays[name] for name in SAMPLE_ARRAYS))
+            channels = Channels(tuple(arrays["channels"].tolist()), tuple(map(tuple, arrays["mix"].tolist())))
+            whole = Samples(queries, arrays["light"], arrays["spread"], arrays["paths"], channels)
             answers = tuple(whole[row] for row in rows)
         return cls(
             tuple(queries[row] for row in rows), tuple(arrays["weights"].tolist()), int(arrays["bounces"]),

@@ -30,13 +30,14 @@ from illumgrid.backends.reference import (
     gradient_normal,
 )
 from illumgrid.errors import BadInput
-from illumgrid.field.levelset import Marchable, marchable
+from illumgrid.field.levelset import Marchable
 from illumgrid.field.scene import Scene
 from illumgrid.field.volume import Floats
+from illumgrid.grid.channels import Channels
 from illumgrid.rng import stream
 from illumgrid.stages import Backend, hookimpl
 from illumgrid.transport.samples import Queries, Samples, in_frame, in_turn
-from illumgrid.transport.tracer import solve_once
+from illumgrid.transport.tracer import laid_out, solve_once
 
 Cast = Callable[[int, Floats, Floats], tuple[Floats, Ints]]
 """First face of field f's mesh along frame rays (n, 3): distance and number in that mesh, each (n,); inf, -1: none."""
@@ -196,7 +197,7 @@ class Embree:
 
     def prepare(self, scene: Scene) -> "EmbreeTracer":
         """Lay the fields out; meshes are built when they are asked for."""
-        return EmbreeTracer(self, scene, marchable(scene), Meshes(scene, grow), pool(self.threads))
+        return EmbreeTracer(self, scene, *laid_out(scene), Meshes(scene, grow), pool(self.threads))
 
     solve = solve_once
 
@@ -207,6 +208,7 @@ class EmbreeTracer:
 
     backend: Embree
     scene: Scene
+    channels: Channels
     fields: Marchable
     meshes: Meshes
     threads: ThreadPoolExecutor | None
@@ -218,7 +220,7 @@ class EmbreeTracer:
     def solve(self, queries: Queries, *, paths: range, bounces: int, seed: int) -> Samples:
         """Trace paths from every query: see `illumgrid.stages.Backend`."""
         n = len(queries)
-        mean, m2 = np.zeros((n, 3), np.float32), np.zeros((n, 3), np.float32)
+        mean, m2 = np.zeros((2, n, len(self.channels)), np.float32)
         count = np.zeros(n, np.int32)
         if n and len(paths):
             point, normal, level = in_frame(self.scene, queries)
@@ -233,7 +235,7 @@ class EmbreeTracer:
                 mean[rows], m2[rows], count[rows] = light, spread, np.where(good, len(paths), 0)
 
             share(self.threads, chunk, self._pieces(queries.level))
-        return Samples(queries, mean, m2, count)
+        return Samples(queries, mean, m2, count, self.channels)
 
     def _pieces(self, level: Floats) -> Iterator[tuple[Casting, NDArray[np.int64]]]:
         """What the rays meet, and queries for which it does."""

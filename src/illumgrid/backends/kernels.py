@@ -707,14 +707,21 @@ def light_from_lamps(scene, choice, u, v, level, on, on_face, x, n):
     return (by_cosine / (by_cosine + by_lamp) if met == number else 0.0), q
 
 
-@jit
-def walk(scene, key, path, bounces, level, own, own_face, x, n):
-    """Worth (red, green, blue) of one path from the frame point x, with normal n, on `own_face` of surface `own`.
+@inlined
+def gather(worth, throughput, weight, light):
+    """Add to what a path is worth the share of some light (C,) that comes back along it."""
+    for channel in range(worth.shape[0]):
+        worth[channel] += throughput[channel] * weight * light[channel]
 
-    The irradiance there is π times the mean over the paths.
+
+@jit
+def walk(scene, key, path, bounces, level, own, own_face, x, n, throughput, worth):
+    """One path from the frame point x, with normal n, on `own_face` of surface `own`: fills its `worth` (C,).
+
+    The irradiance there is π times the mean over the paths. `throughput` (C,) is room for the share of the light that
+    comes back along the path.
     """
-    red, green, blue = 0.0, 0.0, 0.0
-    keep_red, keep_green, keep_blue = 1.0, 1.0, 1.0  # throughput: share of the light that comes back along the path
+    throughput[:], worth[:] = 1.0, 0.0
     on, on_face, fields = own, own_face, scene.start.shape[0]
     for segment in range(bounces + 1):
         # Ask a lamp for its light, weighted against the chance that the ray below finds it. One pair of numbers serves
@@ -723,9 +730,7 @@ def walk(scene, key, path, bounces, level, own, own_face, x, n):
         if scene.lamps.shape[0] > 0:
             choice = draw(key, path, np.uint64(segment))
             weight, q = light_from_lamps(scene, choice, u1, u2, level, on, on_face, x, n)
-            red += keep_red * weight * scene.emission[fields + q, 0]
-            green += keep_green * weight * scene.emission[fields + q, 1]
-            blue += keep_blue * weight * scene.emission[fields + q, 2]
+            gather(worth, throughput, weight, scene.emission[fields + q])
 
         # Choose a direction by the cosine about the normal.
         d = cosine_direction(u1, u2, n[0], n[1], n[2])
@@ -735,9 +740,7 @@ def walk(scene, key, path, bounces, level, own, own_face, x, n):
 
         # A path that escapes sees the background, and ends.
         if what == MISS:
-            red += keep_red * scene.background[0]
-            green += keep_green * scene.background[1]
-            blue += keep_blue * scene.background[2]
+            gather(worth, throughput, 1.0, scene.background)
             break
 
         # A path inside a solid carries no light.
@@ -750,21 +753,17 @@ def walk(scene, key, path, bounces, level, own, own_face, x, n):
             by_cosine, by_lamp = dot(n, d) / np.pi, lamp_density(scene, number - fields, t, d)
             front = dot(scene.quad_normal[number - fields], d) < 0.0
             weight = by_cosine / (by_cosine + by_lamp) if front else 0.0
-        red += keep_red * weight * scene.emission[number, 0]
-        green += keep_green * weight * scene.emission[number, 1]
-        blue += keep_blue * weight * scene.emission[number, 2]
+        gather(worth, throughput, weight, scene.emission[number])
 
         # Reflect: the albedo takes its share, and the path goes on from the hit.
-        keep_red *= scene.albedo[number, 0]
-        keep_green *= scene.albedo[number, 1]
-        keep_blue *= scene.albedo[number, 2]
+        for channel in range(worth.shape[0]):
+            throughput[channel] *= scene.albedo[number, channel]
         on, on_face = number, face
         if t > 0.0 or what == QUAD:
             x = (x[0] + t * d[0], x[1] + t * d[1], x[2] + t * d[2])
             n = hit_normal(scene, number, what, face, x, d)
             if n[0] == 0.0 and n[1] == 0.0 and n[2] == 0.0:
                 break
-    return red, green, blue
 
 
 @jit
@@ -833,10 +832,10 @@ def moments(worth, first, sky, lamplight, channel):
 
 
 @jit
-def solve_queries(scene, ids, point, normal, level, target, first, bounces, seed, worth, mean, m2, paths):
+def solve_queries(scene, ids, point, normal, level, target, first, bounces, seed, throughput, worth, mean, m2, paths):
     """Irradiance at queries in frame coordinates, from a path for each row of `worth`, from number `first` on.
 
-    Fills mean, m2 and paths; `worth` is theirs to write into.
+    Fills mean (n, C), m2 (n, C) and paths (n,); `throughput` (C,) and `worth` (paths, C) are room to write into.
     """
     count = worth.shape[0]
     for i in range(ids.shape[0]):
@@ -848,9 +847,8 @@ def solve_queries(scene, ids, point, normal, level, target, first, bounces, seed
             continue
         key = stream(seed, ids[i])
         for k in range(count):
-            red, green, blue = walk(scene, key, np.uint64(first + k), bounces, level[i], target[i], face, x, n)
-            worth[k, 0], worth[k, 1], worth[k, 2] = red, green, blue
-        for channel in range(3):
+            walk(scene, key, np.uint64(first + k), bounces, level[i], target[i], face, x, n, throughput, worth[k])
+        for channel in range(worth.shape[1]):
             mean_worth, off = moments(worth, first, scene.background[channel], scene.lamplight[channel], channel)
             mean[i, channel], m2[i, channel] = np.pi * mean_worth, np.pi**2 * off
         paths[i] = count

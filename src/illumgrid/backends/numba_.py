@@ -12,11 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from illumgrid.errors import BadInput
-from illumgrid.field.levelset import Marchable, marchable
+from illumgrid.field.levelset import Marchable
 from illumgrid.field.scene import Scene
+from illumgrid.grid.channels import Channels
 from illumgrid.stages import Backend, hookimpl
 from illumgrid.transport.samples import Queries, Samples, in_frame, in_turn
-from illumgrid.transport.tracer import solve_once
+from illumgrid.transport.tracer import laid_out, solve_once
 
 if TYPE_CHECKING:
     from illumgrid.backends.meshes import Meshes
@@ -63,7 +64,7 @@ class Numba:
             from illumgrid.backends.meshes import Meshes
 
             meshes = Meshes(scene, bvh.build)
-        return NumbaTracer(self, scene, marchable(scene), meshes, pool(self.threads))
+        return NumbaTracer(self, scene, *laid_out(scene), meshes, pool(self.threads))
 
     solve = solve_once
 
@@ -74,6 +75,7 @@ class NumbaTracer:
 
     backend: Numba
     scene: Scene
+    channels: Channels
     fields: Marchable
     meshes: "Meshes | None"
     threads: ThreadPoolExecutor | None
@@ -85,25 +87,26 @@ class NumbaTracer:
     def solve(self, queries: Queries, *, paths: range, bounces: int, seed: int) -> Samples:
         """Trace paths from every query: see `illumgrid.stages.Backend`."""
         n = len(queries)
-        mean, m2 = np.zeros((n, 3), np.float32), np.zeros((n, 3), np.float32)
+        mean, m2 = np.zeros((2, n, len(self.channels)), np.float32)
         count = np.zeros(n, np.int32)
-        answer = Samples(queries, mean, m2, count)
+        answer = Samples(queries, mean, m2, count, self.channels)
         if n == 0 or len(paths) == 0:
             return answer
         from illumgrid.backends.kernels import solve_queries
 
-        point, normal, level = in_frame(self.scene, queries)
+        channels, (point, normal, level) = len(self.channels), in_frame(self.scene, queries)
 
         def chunk(surfaces: Any, rows: Rows) -> None:
             if "stack" in surfaces._fields:  # each piece of work has a stack of its own
                 surfaces = surfaces._replace(stack=surfaces.stack.copy())
-            light = np.zeros((len(queries.id[rows]), 3), np.float32)
-            spread, good = np.zeros_like(light), np.zeros(len(light), np.int32)
+            light, spread = np.zeros((2, len(queries.id[rows]), channels), np.float32)
+            good = np.zeros(len(light), np.int32)
             # Random numbers wrap around and misses are infinite, on purpose; without the JIT NumPy would warn of it.
             with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
                 solve_queries(
                     surfaces, queries.id[rows], point[rows], normal[rows], level[rows], queries.target[rows],
-                    paths.start, bounces, np.uint64(seed), np.empty((len(paths), 3)), light, spread, good,
+                    paths.start, bounces, np.uint64(seed), np.empty(channels), np.empty((len(paths), channels)),
+                    light, spread, good,
                 )  # fmt: skip
             mean[rows], m2[rows], count[rows] = light, spread, good
 

@@ -11,13 +11,14 @@ from typing import ClassVar, Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from illumgrid.field.levelset import Marchable, marchable
+from illumgrid.field.levelset import Marchable
 from illumgrid.field.scene import Scene
 from illumgrid.field.volume import ON_A_VOXEL, Floats
+from illumgrid.grid.channels import Channels
 from illumgrid.rng import draw, draw_pair, net_size, sharing, stream
 from illumgrid.stages import Backend, hookimpl
 from illumgrid.transport.samples import Queries, Samples, in_frame, in_turn
-from illumgrid.transport.tracer import solve_once
+from illumgrid.transport.tracer import laid_out, solve_once
 
 Bools = NDArray[np.bool_]
 Ints = NDArray[np.int64]
@@ -328,9 +329,12 @@ def walk(
     x: Floats,
     normal: Floats,
 ) -> Floats:
-    """Worth (n, 3) of one path from each point of a surface: the irradiance is π times the mean."""
+    """Worth (n, C) of one path from each point of a surface: the irradiance is π times the mean.
+
+    `keep` is the share of the light that comes back along the path.
+    """
     scene = surfaces.scene
-    worth, keep = np.zeros((len(x), 3)), np.ones((len(x), 3))  # keep: share of the light that comes back along the path
+    worth, keep = np.zeros((len(x), len(scene.background))), np.ones((len(x), len(scene.background)))
     x, normal, on, on_face = x.copy(), normal.copy(), own.astype(np.int64), own_face.copy()
     alive, fields = np.arange(len(x)), len(scene.start)
     for segment in range(bounces + 1):
@@ -381,7 +385,7 @@ def walk(
 
 
 def mixed_differences(worth: Floats, many: int) -> Floats:
-    """Variance (n, 3) of a path as four of a net (paths, n, 3) in one box tell it: `kernels.mixed_differences`."""
+    """Variance (n, C) of a path as four of a net (paths, n, C) in one box tell it: `kernels.mixed_differences`."""
     last = len(worth).bit_length() - 3
     i, squarest = np.arange(len(worth) // 4), (last + 1) // 2
     shapes = []
@@ -393,7 +397,7 @@ def mixed_differences(worth: Floats, many: int) -> Floats:
 
 
 def net_variance(worth: Floats) -> Floats:
-    """Variance (n, 3) of independent paths that would be as far off as a net (paths, n, 3): `kernels.net_variance`."""
+    """Variance (n, C) of independent paths that would be as far off as a net (paths, n, C): `kernels.net_variance`."""
     if len(worth) == 2:
         return np.asarray((worth[0] - worth[1]) ** 2 / 2)
     many = 2 if len(worth) > 64 and len(worth).bit_length() % 2 == 0 else 3
@@ -406,7 +410,7 @@ def net_variance(worth: Floats) -> Floats:
 
 
 def sum_variance(worth: Floats, first: int) -> Floats:
-    """Variance (n, 3) of the sum of paths (paths, n, 3) number `first` on, as the nets in that range tell it."""
+    """Variance (n, C) of the sum of paths (paths, n, C) number `first` on, as the nets in that range tell it."""
     count, total, known, at = len(worth), np.zeros(worth.shape[1:]), 0, 0
     while at < count:
         size = net_size(first + at, count - at)
@@ -420,7 +424,7 @@ def sum_variance(worth: Floats, first: int) -> Floats:
 
 
 def spread(worth: Floats, first: int, sky: Floats, lamplight: Floats) -> Floats:
-    """The m2 (n, 3) of the mean of paths (paths, n, 3) number `first` on, in such light (3,): `kernels.moments`."""
+    """The m2 (n, C) of the mean of paths (paths, n, C) number `first` on, in such light (C,): `kernels.moments`."""
     count, usual = len(worth), np.maximum(worth.mean(axis=0), sky)
     unseen = (UNSEEN * usual) ** 2 + np.maximum(0.0, worth.max(axis=0) - usual) ** 2 + lamplight**2
     return np.asarray((sum_variance(worth, first) + unseen) * (count - 1) / count)
@@ -430,11 +434,11 @@ def answer(
     surfaces: Surfaces, key: NDArray[np.uint64], level: Floats, target: Ints, x: Floats, normal: Floats,
     paths: range, bounces: int,
 ) -> tuple[Floats, Floats, Bools]:  # fmt: skip
-    """Mean (n, 3) and m2 (n, 3) of the irradiance at queries in the frame, and which are no holes (n,).
+    """Mean (n, C) and m2 (n, C) of the irradiance at queries in the frame, and which are no holes (n,).
 
     A hole has no normal, no surface within reach, or lies inside the solid of a field that is not its own.
     """
-    mean, m2 = np.zeros((len(x), 3)), np.zeros((len(x), 3))
+    mean, m2 = np.zeros((2, len(x), len(surfaces.scene.background)))
     x, face = surfaces.begin(target, x, normal)
     good = normal.any(axis=1) & (face != LOST)
     for f in range(len(surfaces.scene.start)):
@@ -449,7 +453,7 @@ def answer(
             light = walk(
                 surfaces, key[every], block, bounces, level[every], target[every], face[every], x[every], normal[every]
             )
-        light = light.reshape(len(rows), len(paths), 3).swapaxes(0, 1)
+        light = light.reshape(len(rows), len(paths), -1).swapaxes(0, 1)
         mean[rows] = np.pi * light.mean(axis=0)
         m2[rows] = np.pi**2 * spread(light, paths.start, surfaces.scene.background, surfaces.scene.lamplight)
     return mean, m2, good
@@ -464,7 +468,8 @@ class Reference:
 
     def prepare(self, scene: Scene) -> "ReferenceTracer":
         """Lay the fields out."""
-        return ReferenceTracer(scene, Marching(marchable(scene)))
+        channels, fields = laid_out(scene)
+        return ReferenceTracer(scene, channels, Marching(fields))
 
     solve = solve_once
 
@@ -474,6 +479,7 @@ class ReferenceTracer:
     """A scene set up for `Reference`."""
 
     scene: Scene
+    channels: Channels
     surfaces: Marching
 
     @in_turn
@@ -485,7 +491,7 @@ class ReferenceTracer:
         target = queries.target.astype(np.int64)
         mean, m2, good = answer(self.surfaces, key, level, target, point, normal, paths, bounces)
         count = np.where(good, len(paths), 0).astype(np.int32)
-        return Samples(queries, mean.astype(np.float32), m2.astype(np.float32), count)
+        return Samples(queries, mean.astype(np.float32), m2.astype(np.float32), count, self.channels)
 
 
 @hookimpl

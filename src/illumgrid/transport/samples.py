@@ -1,7 +1,7 @@
 """The questions put to a light-transport backend, and its answers."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import reduce, wraps
 from typing import Any, TypeVar, cast
 
@@ -12,6 +12,7 @@ from illumgrid.errors import BadInput
 from illumgrid.field.levelset import upward
 from illumgrid.field.scene import Scene
 from illumgrid.field.volume import Floats, index_to_world, interpolate, outward_normals, project, world_to_index
+from illumgrid.grid.channels import GREY, RGB, Channels, channels_for
 
 _Solve = TypeVar("_Solve", bound=Callable[..., "Samples"])
 
@@ -102,26 +103,51 @@ class Samples:
     Parameters
     ----------
     queries : Queries
-    mean : (n, 3) float32
-        Irradiance, linear RGB, never clamped: π times the mean worth of a cosine-distributed path.
-    m2 : (n, 3) float32
+    mean : (n, C) float32
+        Irradiance in C channels, never clamped: π times the mean worth of a cosine-distributed path. Kept as `light`;
+        the attribute `mean` is its linear RGB, (n, 3).
+    m2 : (n, C) float32
         Spread of the mean, as paths (paths - 1) stderr²: for independent paths the sum of squared deviations; here from
         the differences of paths that share a box of their net, so that it measures noise and not the change of light
-        over the hemisphere, and from what so few paths may have missed.
+        over the hemisphere, and from what so few paths may have missed. Kept as `spread`; `m2` is that of RGB, (n, 3).
     paths : (n,) int32
         Number of paths; 0 marks a hole, whose mean and m2 are 0.
+    channels : Channels, optional
+        By default grey for one channel, RGB for three.
+
+    Attributes
+    ----------
+    light, spread : (n, C) float32
+        What is stored; `mean` and `m2` are read-only views of them.
     """
 
     queries: Queries
     mean: NDArray[np.float32]
     m2: NDArray[np.float32]
     paths: NDArray[np.int32]
+    channels: Channels = None  # type: ignore[assignment]
+    light: NDArray[np.float32] = field(init=False, repr=False)
+    spread: NDArray[np.float32] = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        stored, channels = (self.mean, self.m2), self.channels
+        if channels in (None, GREY) and all(array.shape[-1] == 3 for array in stored):
+            channels = RGB
+            if not any(array.strides[-1] for array in stored):  # the RGB views of grey light
+                stored, channels = (self.mean[:, :1], self.m2[:, :1]), GREY
+        channels = channels_for(self.mean.shape[-1]) if channels is None else channels
+        for names, array in zip((("light", "mean"), ("spread", "m2")), stored):
+            shown = channels.rgb(array).view()
+            shown.flags.writeable = False
+            for name, value in zip(names, (array, shown)):
+                object.__setattr__(self, name, value)
+        object.__setattr__(self, "channels", channels)
 
     def __len__(self) -> int:
         return len(self.paths)
 
     def __getitem__(self, rows: slice | NDArray[np.bool_] | NDArray[np.integer]) -> "Samples":
-        return Samples(self.queries[rows], self.mean[rows], self.m2[rows], self.paths[rows])
+        return Samples(self.queries[rows], self.light[rows], self.spread[rows], self.paths[rows], self.channels)
 
     @property
     def stderr(self) -> NDArray[np.float32]:
@@ -162,10 +188,19 @@ def combine(one: Samples, other: Samples) -> Samples:
         raise BadInput("the samples to combine answer different queries; expected the same ids in the same order")
     a, b = one.paths[:, None].astype(float), other.paths[:, None].astype(float)
     total = np.maximum(a + b, 1.0)
-    apart = other.mean.astype(float) - one.mean
-    mean = one.mean + apart * b / total
-    m2 = one.m2.astype(float) + other.m2 + apart**2 * a * b / total
-    return Samples(one.queries, mean.astype(np.float32), m2.astype(np.float32), one.paths + other.paths)
+    channels, (light, more), (spread, of_more) = _in_common([one, other])
+    change = more.astype(float) - light
+    mean = light + change * b / total
+    m2 = spread.astype(float) + of_more + change**2 * a * b / total
+    return Samples(one.queries, mean.astype(np.float32), m2.astype(np.float32), one.paths + other.paths, channels)
+
+
+def _in_common(parts: Sequence[Samples]) -> tuple[Channels, list[NDArray[np.float32]], list[NDArray[np.float32]]]:
+    """Light and spread of samples in channels that all have: RGB where they differ."""
+    channels = parts[0].channels
+    if all(part.channels == channels for part in parts):
+        return channels, [part.light for part in parts], [part.spread for part in parts]
+    return RGB, [part.mean for part in parts], [part.m2 for part in parts]
 
 
 LONGEST = 1 << 16
@@ -193,8 +228,9 @@ def join_queries(parts: Sequence[Queries]) -> Queries:
 
 def join_samples(parts: Sequence[Samples]) -> Samples:
     """One after the other."""
-    arrays = (np.concatenate([getattr(p, n) for p in parts]) for n in ("mean", "m2", "paths"))
-    return Samples(join_queries([p.queries for p in parts]), *arrays)
+    channels, light, spread = _in_common(parts)
+    queries, paths = join_queries([p.queries for p in parts]), np.concatenate([p.paths for p in parts])
+    return Samples(queries, np.concatenate(light), np.concatenate(spread), paths, channels)
 
 
 def in_frame(scene: Scene, queries: Queries) -> tuple[Floats, Floats, Floats]:

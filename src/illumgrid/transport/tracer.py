@@ -3,7 +3,11 @@
 from dataclasses import dataclass
 from typing import Any, Protocol, cast
 
+import numpy as np
+
+from illumgrid.field.levelset import Marchable, marchable
 from illumgrid.field.scene import Scene
+from illumgrid.grid.channels import Channels, channels_of
 from illumgrid.transport.samples import Queries, Samples
 from illumgrid.transport.stages import Backend
 
@@ -30,6 +34,19 @@ def prepare(backend: Backend, scene: Scene) -> Tracer:
     """Set a scene up for a backend; one that has no method ``prepare`` is asked by its ``solve``."""
     own = getattr(backend, "prepare", None)
     return cast(Tracer, own(scene)) if own else _Unprepared(backend, scene)
+
+
+def laid_out(scene: Scene) -> tuple[Channels, Marchable]:
+    """The channels that a scene needs, and the scene to march through, with albedos and light for each of them.
+
+    All channels are filled from the same paths. A channel has the first colour that it adds to; one of several lights
+    would have the emission of that light only.
+    """
+    channels, fields = channels_of(scene), marchable(scene)
+    color = [int(np.argmax(row)) for row in channels.mix]
+    tables = ("albedo", "emission", "background", "lamplight")
+    own = {name: np.ascontiguousarray(getattr(fields, name)[..., color]) for name in tables}
+    return channels, fields._replace(**own)
 
 
 def solve_once(backend: Any, scene: Scene, queries: Queries, *, paths: range, bounces: int, seed: int) -> Samples:
