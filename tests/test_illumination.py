@@ -94,7 +94,7 @@ def test_saving_draws_the_picture_unless_told_not_to_and_replaces_only_when_told
     light.save(tmp_path / "out")
     with Image.open(tmp_path / "out" / "preview.png") as picture:
         assert np.array_equal(np.asarray(picture), preview.render(light))
-    refused(lambda: light.save(tmp_path / "out"), "finished run", "--overwrite")
+    refused(lambda: light.save(tmp_path / "out"), "finished run", "overwrite=True")
     light.save(tmp_path / "out", preview=False, overwrite=True)
     assert not (tmp_path / "out" / "preview.png").exists()
 

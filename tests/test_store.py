@@ -1,5 +1,6 @@
 """A finished run on the disk: bit by bit the same when it comes back, whole or not there, and never trusted."""
 
+import dataclasses
 import os
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import pytest
 from illumgrid.errors import BadInput
 from illumgrid.field.scene import Field, Levels, Material, Quad, Scene
 from illumgrid.field.volume import Volume
-from illumgrid.grid import GridSpec, IlluminationGrid, WallTexture
+from illumgrid.grid import GREY, RGB, Channels, GridSpec, IlluminationGrid, WallTexture
 from illumgrid.io import store
 
 MIRRORED = ((0, 0, -1), (1, 0, 0), (0, 1, 0))
@@ -145,6 +146,46 @@ def test_other_programs_find_the_documented_layout(tmp_path):
     assert {c.pixels.dtype for p in parts.values() for c in p.channels.values()} == {np.dtype(np.float32)}
 
 
+def test_grey_light_takes_one_channel_of_the_file(tmp_path):
+    stored = example(2)
+    bare = [IlluminationGrid(g.spec, g.light[..., :1], g.error, g.support) for g in stored.grids]
+    walls = tuple(WallTexture(w.light[..., :1], w.support) for w in stored.walls)
+    grey = dataclasses.replace(stored, grids=tuple(bare), walls=walls)
+    store.write(tmp_path / "out", grey, None, False)
+    parts = {p.name(): set(p.channels) for p in OpenEXR.File(str(tmp_path / "out" / store.EXR)).parts}
+    assert parts["light/protons"] == {"Y", "error", "support"} and parts["wall/lamp"] == {"Y", "support"}
+    back = store.read(tmp_path / "out")
+    assert_same(back, grey)
+    assert [part.channels for part in (*back.grids, *back.walls)] == [GREY] * 4
+
+
+def test_channels_of_any_name_and_mix_come_back(tmp_path):
+    stored, rng = example(2), np.random.default_rng(1)
+    key = Channels(("key.R", "key.G", "key.B", "Himmel ρ"), ((1, 0, 0), (0, 1, 0), (0, 0, 1), (0.1, 1 / 3, -2)))
+    grids = [IlluminationGrid(g.spec, rng.random((*g.spec.shape, 4)), g.error, g.support, key) for g in stored.grids]
+    layered = dataclasses.replace(stored, grids=tuple(grids))
+    store.write(tmp_path / "out", layered, None, False)
+    back = store.read(tmp_path / "out")
+    assert_same(back, layered)
+    for one, other in zip(back.grids, grids):
+        assert one.channels == key and np.array_equal(one.light, other.light)
+
+
+def test_a_run_of_format_1_still_loads():
+    """Written by the version before channels had names, of a small ball on a wall."""
+    folder = Path(__file__).with_name("format_1")
+    back = store.read(folder)
+    parts = {p.name(): p for p in OpenEXR.File(str(folder / store.EXR), separate_channels=True).parts}
+    grid, wall = back.grids[0], back.walls[0]
+    assert grid.channels == wall.channels == RGB and grid.values.shape == (3, 4, 3, 3)
+    for c, name in enumerate("RGB"):
+        image = grid.values[..., c].transpose(2, 1, 0).reshape(12, 3)
+        assert np.array_equal(image, parts["light/ball"].channels[name].pixels)
+        assert np.array_equal(wall.values[..., c].reshape(4, 3), parts["wall/wall"].channels[name].pixels)
+    assert grid.values.sum(dtype=float) == pytest.approx(287.47772097587585, rel=1e-12)
+    assert np.isfinite(grid.lookup([[1.5, 4.0, 0.5]])).all()
+
+
 def test_without_a_picture_there_is_none_and_others_may_read(tmp_path):
     before = os.umask(0o022)
     try:
@@ -185,9 +226,9 @@ def test_keys_that_are_numbers_become_text_and_do_not_break_the_checksum(tmp_pat
 
 
 def test_a_finished_run_goes_only_with_overwrite(out):
-    with pytest.raises(BadInput, match="holds a finished run; pass --overwrite or choose another folder with -o"):
+    with pytest.raises(BadInput, match=r"holds a finished run; pass overwrite=True or choose another folder$"):
         store.claim(out, False)
-    with pytest.raises(BadInput, match="--overwrite"):
+    with pytest.raises(BadInput, match="overwrite=True"):
         store.write(out, example(seed=1), None, False)
     assert_same(store.read(out), example())
     store.claim(out, True)
@@ -257,7 +298,7 @@ def test_places_that_cannot_be(tmp_path, kind, overwrite):
     place = make_bad(kind, tmp_path)
     before = sorted(tmp_path.iterdir())
     for refuse in (lambda: store.claim(place, overwrite), lambda: store.write(place, example(), None, overwrite)):
-        with pytest.raises(BadInput, match=f"^{place} .*with -o$"):
+        with pytest.raises(BadInput, match=f"^{place} .*choose another folder$"):
             refuse()
     assert sorted(tmp_path.iterdir()) == before
 

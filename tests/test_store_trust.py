@@ -48,8 +48,8 @@ def test_a_record_that_is_none(out, text):
 
 
 def test_a_format_of_the_future(out):
-    reseal(out, format=2)
-    with pytest.raises(BadInput, match=r"run\.json .* format is 2; illumgrid .* reads format 1"):
+    reseal(out, format=3)
+    with pytest.raises(BadInput, match=r"run\.json .* format is 3; illumgrid .* reads 1 to 2"):
         store.read(out)
 
 

@@ -50,6 +50,13 @@ def main() -> None:
     sys.exit(guarded(lambda: app(standalone_mode=False)))
 
 
+def in_options(sentence: str) -> str:
+    """A sentence of the library, which speaks of arguments, in the options of the command line."""
+    for argument, option in {"overwrite=True": "--overwrite", "another folder": "another folder with -o"}.items():
+        sentence = sentence.replace(argument, option)
+    return sentence
+
+
 def guarded(command: Callable[[], Any]) -> int:
     """Exit code of a command."""
     try:
@@ -61,7 +68,7 @@ def guarded(command: Callable[[], Any]) -> int:
         say("illumgrid: stopped; nothing was written")
         return 130
     except BadInput as error:
-        say(f"illumgrid: {error}")
+        say(f"illumgrid: {in_options(str(error))}")
     except MemoryError:
         say("illumgrid: the memory of this machine is too small for this; choose a coarser --grid or a smaller volume")
     except OSError as error:

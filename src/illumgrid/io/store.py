@@ -2,14 +2,14 @@
 
 ``illumination.exr`` is a multi-part OpenEXR file, float32, scan lines, ZIP. Each field has two parts,
 
-- ``light/<field name>``: channels R, G, B (irradiance), error and support of its illumination grid;
+- ``light/<field name>``: the channels of its illumination grid (R, G, B; or Y, where it is grey), error and support;
 - ``field/<field name>``: channel Y, the field's values as they were used;
 
-and each quad one, ``wall/<quad name>``: channels R, G, B and support of its texels, (nu, nv, rows of the level table).
+and each quad one, ``wall/<quad name>``: light and support of its texels, (nu, nv, rows of the level table).
 
 A 3D array (nx, ny, nz) is an image nx wide and ny*nz high: row = z*ny + y, column = x. ``run.json`` says where the
-arrays lie in the world, and all else. Its ``checksum`` covers itself and the EXR file: the EXR library never sees a
-damaged file, and a digit that changed is never taken for a result.
+arrays lie in the world, how channels of light mix to RGB, and all else. Its ``checksum`` covers itself and the EXR
+file: the EXR library never sees a damaged file, and a digit that changed is never taken for a result.
 """
 
 import hashlib
@@ -18,7 +18,7 @@ import os
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from math import prod
 from pathlib import Path
@@ -31,19 +31,19 @@ from numpy.typing import NDArray
 from illumgrid.errors import BadInput
 from illumgrid.field.scene import Field, Levels, Material, Quad, Scene
 from illumgrid.field.volume import Lattice, Volume
-from illumgrid.grid import GridSpec, IlluminationGrid, WallTexture
+from illumgrid.grid import RGB, Channels, GridSpec, IlluminationGrid, WallTexture
 
-FORMAT = 1
+FORMAT = 2  # 1 had RGB only
 EXR, RUN, PREVIEW = "illumination.exr", "run.json", "preview.png"
 PLACE = ("origin", "spacing", "direction")
 EDGES = ("corner", "edge_u", "edge_v")
 LAYOUT = "array (nx, ny, nz) = ({}, {}, {}); row = z*ny + y, column = x"
 DEFLATE_AT_MOST = 1032  # bytes out for one byte in: a file that claims more is refused before memory is asked for
-ELSEWHERE = "choose another folder with -o"
+ELSEWHERE = "choose another folder"
 AGAIN = "give a folder that 'illumgrid run' wrote, or run it again"
 
 Image = NDArray[np.float32]
-Plan = dict[str, tuple[tuple[int, int, int], str]]  # of every part, in the order of the file: array shape, channels
+Plan = dict[str, tuple[tuple[int, int, int], list[str]]]  # by part, in the order of the file: array shape, channels
 Record = dict[str, Any]  # the content of run.json
 
 
@@ -89,10 +89,10 @@ def claim(folder: str | os.PathLike[str], overwrite: bool) -> None:
         if place.is_symlink() or not place.is_dir():
             raise BadInput(f"{folder} is {'a symbolic link' if place.is_symlink() else 'not a folder'}; {ELSEWHERE}")
         if os.path.ismount(place) or place.samefile(Path.cwd()):  # the folder is replaced as a whole
-            raise BadInput(f"{folder} is a mount point or the folder you are in; choose a folder inside it with -o")
+            raise BadInput(f"{folder} is a mount point or the folder you are in; {ELSEWHERE}")
         _refuse_foreign(place, folder)
         if not overwrite and any(place.iterdir()):
-            raise BadInput(f"{folder} holds a finished run; pass --overwrite or {ELSEWHERE}")
+            raise BadInput(f"{folder} holds a finished run; pass overwrite=True or {ELSEWHERE}")
 
 
 def _refuse_foreign(place: Path, folder: str | os.PathLike[str]) -> None:
@@ -182,7 +182,7 @@ def _sentences(trouble: str, remedy: str) -> Iterator[None]:
     try:
         yield
     except BadInput as reason:
-        if str(reason).endswith(("with -o", remedy)):
+        if str(reason).endswith((ELSEWHERE, remedy)):
             raise
         raise BadInput(f"{trouble}: {reason}; {remedy}") from reason
     except Exception as reason:  # the EXR library raises RuntimeError, ValueError, UnicodeDecodeError...
@@ -208,12 +208,15 @@ def _describe(stored: Stored) -> Record:
         | {"albedo": q.material.albedo.tolist(), "emission": q.material.emission.tolist()}
         for q in stored.scene.quads
     ]
+    lit = {f"light/{f.name}": grid.channels for f, grid in zip(stored.scene.fields, stored.grids)}
+    lit |= {f"wall/{q.name}": wall.channels for q, wall in zip(stored.scene.quads, stored.walls)}
     record = {
         "format": FORMAT,
         "illumgrid": version("illumgrid"),
         "scene": {"fields": fields, "quads": quads, "background": stored.scene.background.tolist()},
         "levels": np.asarray(stored.levels.table, float).tolist(),
         "grids": {f.name: lattice(grid.spec) for f, grid in zip(stored.scene.fields, stored.grids)},
+        "channels": {part: asdict(channels) for part, channels in lit.items()},
         "recipe": stored.recipe,
     }
     return dict(json.loads(json.dumps(record, allow_nan=False)))
@@ -229,8 +232,8 @@ def _checksum(record: Record, exr: Path) -> str:
 
 def _read_record(path: Path) -> Record:
     record: Record = json.loads(path.read_text(encoding="utf-8"))
-    if record["format"] != FORMAT:
-        raise BadInput(f"its format is {record['format']!r}; illumgrid {version('illumgrid')} reads format {FORMAT}")
+    if record["format"] not in (1, FORMAT):
+        raise BadInput(f"its format is {record['format']!r}; illumgrid {version('illumgrid')} reads 1 to {FORMAT}")
     if not isinstance(record["recipe"], dict):
         raise BadInput("its recipe is not a table")
     return record
@@ -239,18 +242,23 @@ def _read_record(path: Path) -> Record:
 def _rebuild(record: Record, parts: dict[str, dict[str, Image]]) -> Stored:
     grids, fields = [], []
     for about in record["scene"]["fields"]:
-        where, light = record["grids"][about["name"]], parts.pop(f"light/{about['name']}")
-        spec = GridSpec(_shape(where), *(where[k] for k in PLACE))
-        values, error, support = (_array(light.pop(c), spec.shape) for c in ("RGB", "error", "support"))
-        grids.append(IlluminationGrid(spec, values, error, support))
-        values = _array(parts.pop(f"field/{about['name']}")["Y"], _shape(about))
+        where, part = record["grids"][about["name"]], f"light/{about['name']}"
+        spec, channels, light = (
+            GridSpec(_shape(where), *(where[k] for k in PLACE)),
+            _channels(record, part),
+            parts.pop(part),
+        )
+        values, error, support = (_array(light, names, spec.shape) for names in (channels.names, "error", "support"))
+        grids.append(IlluminationGrid(spec, values, error, support, channels))
+        values = _array(parts.pop(f"field/{about['name']}"), "Y", _shape(about))
         volume, material = Volume(values, *(about[k] for k in PLACE)), Material(about["albedo"], about["emission"])
         fields.append(Field(about["name"], volume, material, about["range"], about["inside"]))
     quads, walls = [], []
     for about in record["scene"]["quads"]:
-        texels, shape = parts.pop(f"wall/{about['name']}"), _wall_shape(about, record)
-        values, support = (_array(texels[c], shape).swapaxes(0, 2) for c in ("RGB", "support"))
-        walls.append(WallTexture(np.ascontiguousarray(values), np.ascontiguousarray(support)))
+        part, shape = f"wall/{about['name']}", _wall_shape(about, record)
+        texels, channels = parts.pop(part), _channels(record, part)
+        values, support = (_array(texels, names, shape).swapaxes(0, 2) for names in (channels.names, "support"))
+        walls.append(WallTexture(values, np.ascontiguousarray(support), channels))
         material = Material(about["albedo"], about["emission"])
         corner, edge_u, edge_v = (np.array(about[name], float) for name in EDGES)
         quads.append(Quad(about["name"], corner, edge_u, edge_v, material, (shape[0], shape[1])))
@@ -272,34 +280,51 @@ def _wall_shape(about: Record, record: Record) -> tuple[int, int, int]:
     raise BadInput(f"the texels {str(about['texels'])[:80]} came; expected two whole numbers of at least 1")
 
 
+def _channels(record: Record, part: str) -> Channels:
+    if record["format"] == 1:
+        return RGB
+    match record["channels"][part]:
+        case {"names": [*names], "mix": [*mix]} if len(names) == len(mix) and np.isfinite(np.array(mix, float)).all():
+            return Channels(tuple(map(str, names)), tuple((float(r), float(g), float(b)) for r, g, b in mix))
+    raise BadInput(f"the channels of {part!r} are {str(record['channels'][part])[:80]}; expected names and their mix")
+
+
 def _plan(record: Record) -> Plan:
     plan: Plan = {}
     for about in record["scene"]["fields"]:
-        plan[f"light/{about['name']}"] = _shape(record["grids"][about["name"]]), "B G R error support"
-        plan[f"field/{about['name']}"] = _shape(about), "Y"
+        part = f"light/{about['name']}"
+        names = sorted((*_channels(record, part).names, "error", "support"))
+        plan[part] = _shape(record["grids"][about["name"]]), names
+        plan[f"field/{about['name']}"] = _shape(about), ["Y"]
     for about in record["scene"]["quads"]:
-        plan[f"wall/{about['name']}"] = _wall_shape(about, record), "B G R support"
+        part = f"wall/{about['name']}"
+        plan[part] = _wall_shape(about, record), sorted((*_channels(record, part).names, "support"))
     return plan
 
 
 def _image(array: Image) -> Image:
-    """Lay out an array (nx, ny, nz) as an image (nz*ny, nx), an array (nx, ny, nz, 3) as (nz*ny, nx, 3)."""
-    nx, ny, nz = array.shape[:3]
-    return np.ascontiguousarray(array.swapaxes(0, 2)).reshape(nz * ny, nx, *array.shape[3:])
+    """Lay out an array (nx, ny, nz) as an image (nz*ny, nx)."""
+    nx, ny, nz = array.shape
+    return np.ascontiguousarray(array.swapaxes(0, 2)).reshape(nz * ny, nx)
 
 
-def _array(image: Image, shape: tuple[int, int, int]) -> Image:
-    """Undo `_image`, without a copy."""
-    return image.reshape(*shape[::-1], *image.shape[2:]).swapaxes(0, 2)
+def _array(part: dict[str, Image], names: str | tuple[str, ...], shape: tuple[int, int, int]) -> Image:
+    """Undo `_image`: one channel as (nx, ny, nz), without a copy; several as (nx, ny, nz, C)."""
+    if isinstance(names, str):
+        return part[names].reshape(shape[::-1]).swapaxes(0, 2)
+    return np.stack([_array(part, name, shape) for name in names], axis=-1)
 
 
 def _write_exr(path: Path, stored: Stored) -> None:
+    def split(of: IlluminationGrid | WallTexture) -> dict[str, Image]:
+        return {name: of.light[..., c] for c, name in enumerate(of.channels.names)}
+
     arrays: dict[str, dict[str, Image]] = {}
     for f, grid in zip(stored.scene.fields, stored.grids):
-        arrays[f"light/{f.name}"] = {"RGB": grid.values, "error": grid.error, "support": grid.support}
+        arrays[f"light/{f.name}"] = split(grid) | {"error": grid.error, "support": grid.support}
         arrays[f"field/{f.name}"] = {"Y": f.volume.values}
     for quad, wall in zip(stored.scene.quads, stored.walls):
-        turned = {"RGB": wall.values, "support": wall.support}
+        turned = split(wall) | {"support": wall.support}
         arrays[f"wall/{quad.name}"] = {channel: array.swapaxes(0, 2) for channel, array in turned.items()}
     shapes = [next(iter(channels.values())).shape for channels in arrays.values()]
     window = ((0, 0), (max(s[0] for s in shapes) - 1, max(s[1] * s[2] for s in shapes) - 1))  # all parts must share it
@@ -312,14 +337,14 @@ def _write_exr(path: Path, stored: Stored) -> None:
 
 
 def _read_exr(path: Path, plan: Plan) -> dict[str, dict[str, Image]]:
-    """Images of every part by channel, "RGB" as one, if the headers agree with the plan."""
+    """Images of every part by channel, if the headers agree with the plan."""
     size = path.stat().st_size
-    if sum(4 * prod(shape) * len(channels.split()) for shape, channels in plan.values()) > DEFLATE_AT_MOST * size:
+    if sum(4 * prod(shape) * len(channels) for shape, channels in plan.values()) > DEFLATE_AT_MOST * size:
         raise BadInput(f"its {size} bytes cannot hold the arrays that {RUN} tells of")
     kind = OpenEXR.scanlineimage, OpenEXR.ZIP_COMPRESSION
-    expected = [(name, *kind, [[0, 0], [x - 1, z * y - 1]], c.split()) for name, ((x, y, z), c) in plan.items()]
+    expected = [(name, *kind, [[0, 0], [x - 1, z * y - 1]], c) for name, ((x, y, z), c) in plan.items()]
     for pixels in (False, True):
-        file = OpenEXR.File(os.fsencode(path), header_only=not pixels)
+        file = OpenEXR.File(os.fsencode(path), separate_channels=True, header_only=not pixels)
         found = []  # the library leaves out a part whose pixels it cannot read; before 3.4.12, all without pixels
         for h in (part.header for part in file.parts):
             window = [np.asarray(corner).tolist() for corner in h["dataWindow"]]

@@ -62,7 +62,7 @@ def lit(light: "Illumination", number: int, isovalue: float | None, progress: "P
     if not low <= level <= high:
         raise BadInput(
             f"the isovalue is {level:g}, but the light of field {field.name!r} is that of {low:g} to {high:g}; choose "
-            "one within, or run again with another --range"
+            "one within, or compute the light of a wider range"
         )
     progress("surface", 0, 2)
     mesh = isosurface(field.volume, level, field.inside)
