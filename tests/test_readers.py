@@ -8,7 +8,6 @@ import pytest
 import SimpleITK as sitk  # noqa: N813
 import tifffile
 
-from illumgrid.errors import IllumgridWarning
 from illumgrid.field.volume import index_to_world
 from illumgrid.io.readers import read_volume, volume_name
 from volume_files import (
@@ -21,7 +20,6 @@ from volume_files import (
     values,
     vtk_head,
     write,
-    write_series,
     zipped,
 )
 
@@ -214,54 +212,6 @@ def test_real_volume_lies_where_itk_says(name):
     there = [reader.TransformIndexToPhysicalPoint(corner) for corner in corners]
     assert np.allclose(index_to_world(volume, corners), there, rtol=0, atol=1e-6)
     assert all(volume.values[corner] == reader.GetPixel(corner) for corner in corners)
-
-
-# DICOM
-
-
-def test_dicom(tmp_path):
-    write_series(tmp_path / "scan", values("uint16"))
-    write_series(tmp_path / "scan", values("uint16")[:, :, :1], uid="1.2.4")  # a localizer is no stack
-    (tmp_path / "scan" / "notes.txt").write_text("a file of another kind")
-    volume = read_volume(tmp_path / "scan")
-    assert np.array_equal(volume.values, values())
-    assert np.allclose(volume.origin, ORIGIN) and np.allclose(volume.spacing, SPACING)
-    assert np.allclose(volume.direction, TURN * [1, 1, -1])
-
-
-def test_dicom_of_many_frames(tmp_path):
-    (tmp_path / "scan").mkdir()
-    write(tmp_path / "scan" / "a.dcm", values("uint16"), np.eye(3))
-    for path in (tmp_path / "scan", tmp_path / "scan" / "a.dcm", zipped(tmp_path / "scan" / "a.dcm")):
-        assert np.array_equal(read_volume(path).values, values())
-
-
-def test_dicom_of_two_stacks(tmp_path):
-    write_series(tmp_path / "scan", values("uint16"))
-    write_series(tmp_path / "scan", values("uint16"), uid="1.2.4")
-    refused(tmp_path / "scan", "1.2.3 (7 files)", "1.2.4 (7 files)")
-
-
-def test_dicom_with_a_gap(tmp_path):
-    write_series(tmp_path / "scan", values("uint16"), drop=(2,))
-    with pytest.warns(IllumgridWarning, match="scan: slices are missing"):
-        assert read_volume(tmp_path / "scan").shape == (5, 6, 6)
-
-
-def test_dicom_with_a_cut_slice(tmp_path):
-    write_series(tmp_path / "scan", values("uint16"))
-    last = tmp_path / "scan" / "1.2.3-3.dcm"
-    last.write_bytes(last.read_bytes()[:-9])
-    with pytest.warns(IllumgridWarning, match=r"1 DICOM files .* left out: 1.2.3-3.dcm"):
-        assert read_volume(tmp_path / "scan").shape == (5, 6, 6)
-
-
-def test_no_dicom(tmp_path):
-    write(tmp_path / "a.nrrd")
-    refused(tmp_path, "none", "DICOM")
-    write_series(tmp_path / "scan", values("uint16")[:, :, :1])
-    refused(tmp_path / "scan", "1.2.3 (1 files)")
-    refused(next((tmp_path / "scan").iterdir()), "5x6x1", "folder")
 
 
 # Names

@@ -7,6 +7,7 @@ import pytest
 import pyvista as pv
 from vtkmodules.vtkIOXML import vtkXMLImageDataWriter
 
+from illumgrid.errors import IllumgridWarning
 from illumgrid.field.volume import index_to_world
 from illumgrid.io.readers import read_volume, volume_name
 from volume_files import ORIGIN, SPACING, TURN, refused, refused_lightly, values, zipped
@@ -64,24 +65,25 @@ def test_an_extent_that_does_not_begin_at_zero(tmp_path):
 
 
 def test_the_scalars_among_many_arrays(tmp_path):
-    vti(tmp_path / "a.vti", color=np.zeros((210, 3), np.uint8), other=np.zeros(210))
-    assert np.array_equal(read_volume(tmp_path / "a.vti").values, values())
+    vti(tmp_path / "a.vti", color=np.zeros((210, 3), np.uint8), other=np.arange(210.0))
+    with pytest.warns(IllumgridWarning, match=r"choice: a.vti: its array density .* other \(1\)"):
+        assert np.array_equal(read_volume(tmp_path / "a.vti").values, values())
+    assert read_volume(tmp_path / "a.vti", array="other").values[4, 5, 6] == 209
+    assert not read_volume(tmp_path / "a.vti", array="color", channel=2).values.any()
     text = (tmp_path / "a.vti").read_bytes()
     (tmp_path / "b.vti").write_bytes(text.replace(b'Scalars="density"', b""))
     refused(tmp_path / "b.vti", "density (1), color (3), other (1)", "one component")
     vti(tmp_path / "c.vti", color=np.zeros((210, 3), np.uint8))
     text = (tmp_path / "c.vti").read_bytes()
     (tmp_path / "c.vti").write_bytes(text.replace(b'Scalars="density"', b""))
-    assert np.array_equal(read_volume(tmp_path / "c.vti").values, values())
+    with pytest.warns(IllumgridWarning, match="choice"):
+        assert np.array_equal(read_volume(tmp_path / "c.vti").values, values())
 
 
 def test_what_is_no_volume_of_points(tmp_path):
     image = pv.ImageData(dimensions=(3, 4, 5))
     image.save(tmp_path / "a.vti")
     refused(tmp_path / "a.vti", "none", "point data")
-    image.cell_data["h"] = np.zeros(image.n_cells)
-    image.save(tmp_path / "b.vti")
-    refused(tmp_path / "b.vti", "none", "point data")
     vti(tmp_path / "c.vti", values(shape=(1, 5, 6)))
     refused(tmp_path / "c.vti", "1x5x6", "at least 2")
     pv.Sphere().save(tmp_path / "d.vtp")
@@ -124,7 +126,42 @@ def test_entities_that_grow_are_not_followed(tmp_path):
     refused(tmp_path / "a.vti")
 
 
-def test_without_vtk_the_command_that_installs_it_is_told(tmp_path, monkeypatch):
-    vti(tmp_path / "a.vti")
-    monkeypatch.setitem(sys.modules, "vtkmodules.vtkIOXML", None)
-    refused(tmp_path / "a.vti", "pip install vtk")
+def test_cells_are_voxels_half_a_step_further(tmp_path):
+    image = pv.ImageData(dimensions=(4, 5, 6), origin=ORIGIN, spacing=SPACING, direction_matrix=TURN)
+    image.cell_data["h"] = np.arange(60.0)
+    image.save(tmp_path / "a.vti")
+    volume = read_volume(tmp_path / "a.vti")
+    centres = image.cell_centers().points.reshape(5, 4, 3, 3).transpose(2, 1, 0, 3)  # as VTK computes them
+    assert np.array_equal(volume.values, np.arange(60).reshape(5, 4, 3).T)
+    assert np.allclose(index_to_world(volume, [[0, 0, 0], [2, 1, 4]]), [centres[0, 0, 0], centres[2, 1, 4]], atol=1e-5)
+
+
+def test_pieces_are_joined(tmp_path):
+    image = vti(tmp_path / "a.vti")
+    text = '<VTKFile type="ImageData" version="1.0" byte_order="LittleEndian"><ImageData WholeExtent="0 4 0 5 0 6">'
+    for low, high in ((0, 3), (3, 6)):
+        numbers = " ".join(map(str, values()[:, :, low : high + 1].ravel(order="F")))
+        text += f'<Piece Extent="0 4 0 5 {low} {high}"><PointData Scalars="density"><DataArray type="UInt8" '
+        text += f'Name="density" format="ascii">{numbers}</DataArray></PointData></Piece>'
+    (tmp_path / "b.vti").write_text(f"{text}</ImageData></VTKFile>")
+    there = pv.read(tmp_path / "b.vti")["density"]
+    assert np.array_equal(read_volume(tmp_path / "b.vti").values.ravel(order="F"), there)
+    assert np.array_equal(there, image["density"])
+    (tmp_path / "c.vti").write_text(text.partition('<Piece Extent="0 4 0 5 3 6"')[0] + "</ImageData></VTKFile>")
+    refused(tmp_path / "c.vti", "do not cover")
+
+
+def test_without_lz4_the_command_that_installs_it_is_said(tmp_path, monkeypatch):
+    vti(tmp_path / "a.vti", packer="lz4")
+    monkeypatch.setitem(sys.modules, "lz4.block", None)
+    refused(tmp_path / "a.vti", "pip install lz4")
+
+
+def test_a_flipped_bit_in_packed_data_is_seen(tmp_path):
+    vti(tmp_path / "a.vti", np.random.default_rng(0).normal(size=(9, 8, 7)))
+    whole = bytearray((tmp_path / "a.vti").read_bytes())
+    for at in range(whole.index(b"_", whole.index(b"<AppendedData")) + 60, len(whole) - 60, 97):
+        whole[at] ^= 4
+        (tmp_path / "b.vti").write_bytes(whole)
+        refused(tmp_path / "b.vti", "cannot be read")
+        whole[at] ^= 4

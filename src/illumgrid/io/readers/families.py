@@ -28,7 +28,7 @@ class Family:
 
 FAMILIES = (
     # DICOM first: its preamble may look like a TIFF.
-    Family("DICOM", "itk", (".dcm", ".ima"), ((128, b"DICM"),), ("time", "array"), True),
+    Family("DICOM", "dicom", (".dcm", ".ima"), ((128, b"DICM"),), ("channel", "time", "array"), True),
     Family(
         *("TIFF", "itk", (".tif", ".tiff", ".lsm", ".btf")),
         starts=((0, b"II*\0"), (0, b"MM\0*"), (0, b"II+\0"), (0, b"MM\0+")),
@@ -57,8 +57,10 @@ FAMILIES = (
         starts=((0, b"\x93NUMPY"), (0, b"PK\x03\x04")),
         chooses=("channel", "time", "array"),
     ),
-    Family("legacy VTK", "itk", (".vtk",), ((0, b"# vtk DataFile"),), ("array",)),
-    Family("VTK image", "vti", (".vti",), ((0, b"<VTKFile"), (0, b"<?xml")), ("array",)),
+    Family("legacy VTK", "vtk", (".vtk",), ((0, b"# vtk DataFile"),), ("channel", "array")),
+    Family("VTK image", "vti", (".vti",), ((0, b"<VTKFile"), (0, b"<?xml")), ("channel", "array")),
+    Family("Gaussian cube", "cube", (".cube", ".cub"), chooses=("array",)),
+    Family("OpenDX", "dx", (".dx",)),
     Family("ITK", "itk", (".gipl", ".h5", ".hdf5"), ((0, b"\x89HDF\r\n\x1a\n"),)),
 )
 """In the order in which they are tried."""

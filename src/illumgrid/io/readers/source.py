@@ -204,7 +204,7 @@ def read_text(stream: IO[bytes], count: int) -> NDArray[np.float64]:
         cut = len(text) if not chunk else max(text.rfind(b" "), text.rfind(b"\n"), text.rfind(b"\t")) + 1
         text, rest = text[:cut], text[cut:]
         try:
-            words = np.array(text.split(), dtype=float)[: count - done]
+            words = np.array(text.split()[: count - done], dtype=float)
         except ValueError as problem:
             raise BadInput(
                 f"holds what is no number ({str(problem)[-60:]}); expected {count} numbers; mend it"

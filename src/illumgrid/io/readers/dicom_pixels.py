@@ -1,0 +1,214 @@
+"""Pixels of DICOM files: unpacked by pydicom, scaled slice by slice, put onto the even lattice of their stack."""
+
+import mmap
+import warnings
+import zlib
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pydicom
+from numpy.typing import NDArray
+from pydicom.pixels.decoders.base import get_decoder
+from pydicom.pixels.utils import get_expected_length, iter_pixels, pixel_array
+
+from illumgrid.errors import BadInput
+from illumgrid.io.readers.dicom_frames import Kind
+from illumgrid.io.readers.dicom_stack import Stack
+from illumgrid.io.readers.limits import AS_FLOAT, check_memory, check_size
+from illumgrid.io.readers.source import AGAIN, Source, opened, seekable
+from illumgrid.io.readers.stored import Note, Wanted, pick
+
+MOST_PACKED = 1 << 14
+"""Times its file that a compressed image can unpack to: an empty slice of JPEG-LS takes some hundred bytes."""
+
+DEFLATED = "1.2.840.10008.1.2.1.99"
+
+CODECS = "pylibjpeg pylibjpeg-libjpeg pylibjpeg-openjpeg"
+
+
+@contextmanager
+def quiet() -> Iterator[list[Any]]:
+    """Collect pydicom's warnings: on oddities of headers they mean nothing here, on pixels they do."""
+    with warnings.catch_warnings(record=True) as collected:
+        warnings.simplefilter("always")
+        yield collected
+
+
+@contextmanager
+def _bytes(source: Source) -> Iterator[Any]:
+    """The file as something to seek in that gives no more bytes than it has, whatever length is asked for."""
+    if source.packed:
+        with seekable(source) as stream:
+            yield stream
+        return
+    with opened(source) as stream, mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as mapped:
+        yield mapped
+
+
+def dataset(source: Source, header_only: bool) -> Any:
+    """Read the data set of a file, with or without its pixels."""
+    with quiet(), _bytes(source) as stream:
+        _check_deflated(stream, source)
+        try:
+            # force: files without preamble; what is none was turned away by its first bytes
+            return pydicom.dcmread(stream, stop_before_pixels=header_only, force=True)
+        except BadInput:
+            raise
+        except MemoryError:
+            raise
+        except Exception as problem:
+            what = " ".join(str(problem).split())[:120] or type(problem).__name__
+            raise BadInput(f"its DICOM header cannot be read ({what}); {AGAIN}") from None
+
+
+def _check_deflated(stream: Any, source: Source) -> None:
+    """Measure what a deflated data set unpacks to, before pydicom unpacks it whole."""
+    if DEFLATED.encode() not in source.head:
+        return
+    stream.seek(144 + int.from_bytes(source.head[140:144], "little"))  # behind the group of the file's own header
+    unpack, done, packed = zlib.decompressobj(-zlib.MAX_WBITS), 0, stream.read()
+    while not unpack.eof:
+        out = unpack.decompress(packed, 1 << 20)
+        done += len(out)
+        check_memory(3 * done)
+        packed = unpack.unconsumed_tail
+        if not out and not packed:
+            raise BadInput(f"its packed data end too early; {AGAIN}")
+    stream.seek(0)
+
+
+def planes_of(stack: Stack, sources: dict[Path, Source], wanted: Wanted) -> tuple[NDArray[Any], list[Note]]:
+    """Stored values (n, rows, columns) of the frames of a stack, in its order."""
+    kind = stack.frames[0].kind
+    files = list(dict.fromkeys(frame.file for frame in stack.frames))
+    cells = len(stack.frames) * kind.rows * kind.columns
+    held = sum(sources[file].most for file in files)
+    promised = cells * kind.samples * kind.bits // 8
+    check_size(promised, held * MOST_PACKED, cells * (max(8, kind.bits) // 8 * 2 + AS_FLOAT))
+    _check_colours(kind.samples, kind.colours, wanted)
+    planes: NDArray[Any] | None = None
+    notes: list[Note] = []
+    for file in files:
+        slots = {frame.index: k for k, frame in enumerate(stack.frames) if frame.file == file}
+        for index, plane in decoded(sources[file], sorted(slots), kind, notes):
+            if kind.samples > 1:
+                plane = plane[..., pick(wanted.channel, "channel", ["red", "green", "blue"][: kind.samples])]
+            if planes is None:
+                planes = np.zeros((len(stack.frames), kind.rows, kind.columns), plane.dtype)
+            if plane.shape != planes.shape[1:]:
+                raise BadInput(f"{file.name} unpacks to {plane.shape} pixels; expected {planes.shape[1:]}; {AGAIN}")
+            if plane.dtype != planes.dtype:
+                planes = planes.astype(np.result_type(planes.dtype, plane.dtype))
+            planes[slots[index]] = plane
+    assert planes is not None
+    return planes, notes
+
+
+def _check_colours(samples: int, colours: str, wanted: Wanted) -> None:
+    if colours == "PALETTE COLOR":
+        raise BadInput("its values are numbers of colours in a palette; expected measured values; there are none in it")
+    if samples > 1 and wanted.channel is None:
+        raise BadInput(
+            f"holds colours ({samples} samples a pixel, {colours}); expected one value at each voxel; choose one with "
+            "--channel N (channel=N)"
+        )
+
+
+def decoded(
+    source: Source, indices: Sequence[int], kind: Kind, notes: list[Note]
+) -> Iterator[tuple[int, NDArray[Any]]]:
+    """The frames `indices` of a file, unpacked."""
+    name = source.file.name
+    data = dataset(source, header_only=False)
+    meta = getattr(data, "file_meta", None)
+    if meta is None or not meta.get("TransferSyntaxUID"):
+        data.file_meta = meta = meta if meta is not None else pydicom.dataset.FileMetaDataset()
+        implicit, little = data.original_encoding
+        uids = pydicom.uid
+        explicit = uids.ExplicitVRLittleEndian if little else uids.ExplicitVRBigEndian
+        meta.TransferSyntaxUID = uids.ImplicitVRLittleEndian if implicit else explicit
+    if not any(word in data for word in ("PixelData", "FloatPixelData", "DoubleFloatPixelData")):
+        raise BadInput(f"{name} ends before its pixels; {AGAIN}")
+    _check_packed(data, name)
+    with quiet() as collected:
+        try:
+            if kind.bits == 1:  # frames need not begin at a whole byte, which iter_pixels asks for
+                bits = pixel_array(data).reshape(-1, kind.rows, kind.columns)
+                yield from ((index, bits[index]) for index in indices)
+                return
+            for index, plane in zip(indices, iter_pixels(data, indices=indices)):
+                yield index, _real(plane, data)
+        except (BadInput, MemoryError):
+            raise
+        except Exception as problem:
+            what = " ".join(str(problem).replace("\n", " ").split())[:160].replace(". ", ", ").rstrip(".")
+            raise BadInput(f"the pixels of {name} cannot be read ({what}); {AGAIN}") from None
+    said = {" ".join(str(one.message).split()) for one in collected if "pixel data" in str(one.message).lower()}
+    odd = [sentence for sentence in said if "excess padding" not in sentence]  # zeros at the end are usual
+    if odd and len(notes) < 4:
+        notes.append(("dicom", f"{name}: {odd[0][:200]}"))
+
+
+def _check_packed(data: Any, name: str) -> None:
+    """Say which package unpacks a compressed file, if none is there; refuse a plain one that is too short."""
+    syntax = data.file_meta.TransferSyntaxUID
+    try:
+        decoder = get_decoder(syntax)
+    except NotImplementedError:
+        raise BadInput(
+            f"its pixels are packed as {syntax.name}, which pydicom does not read; expected JPEG, JPEG-LS, JPEG 2000, "
+            "RLE or plain pixels; unpack it elsewhere (gdcmconv --raw)"
+        ) from None
+    if not decoder.is_available:
+        raise BadInput(
+            f"its pixels are packed as {syntax.name}, which needs packages that are not installed; expected them "
+            f"beside illumgrid: pip install {CODECS}"
+        )
+    if not syntax.is_encapsulated and "PixelData" in data:
+        promised, held = get_expected_length(data), len(data.PixelData)
+        if held < promised:
+            raise BadInput(f"{name} ends after {held} of {promised} bytes of pixels; {AGAIN}")
+
+
+def _real(plane: NDArray[Any], data: Any) -> NDArray[Any]:
+    """Values of a plane before slope and intercept: through the table of the modality, where there is one."""
+    if data.get("ModalityLUTSequence"):
+        from pydicom.pixels.processing import apply_modality_lut
+
+        return np.asarray(apply_modality_lut(plane, data))
+    return plane
+
+
+def scaled(planes: NDArray[Any], stack: Stack) -> tuple[NDArray[Any], float, float]:
+    """Stored values with the one slope and intercept of all slices; or, where these differ, the values themselves."""
+    scales = np.array([(frame.slope, frame.intercept) for frame in stack.frames])
+    if (scales == scales[0]).all():
+        return planes, float(scales[0, 0]), float(scales[0, 1])
+    kind = np.float32 if planes.dtype.itemsize <= 2 else np.float64
+    check_memory(planes.size * kind().itemsize * 2)
+    out = np.empty(planes.shape, kind)
+    for plane, scaled, (slope, intercept) in zip(planes, out, scales):
+        scaled[...] = plane * slope + intercept
+    return out, 1.0, 0.0
+
+
+def on_lattice(planes: NDArray[Any], stack: Stack) -> NDArray[Any]:
+    """Slices at every place of the even lattice: those that are there, others between their neighbours."""
+    at = stack.at
+    if len(at) == stack.count and np.abs(at - np.arange(stack.count)).max() < 1e-3:
+        return planes
+    check_memory(stack.count * planes[0].size * planes.itemsize)
+    out = np.empty((stack.count, *planes.shape[1:]), planes.dtype)
+    for k in range(stack.count):
+        near = int(np.argmin(np.abs(at - k)))
+        if abs(at[near] - k) < 1e-3:
+            out[k] = planes[near]
+            continue
+        after = min(max(int(np.searchsorted(at, k)), 1), len(at) - 1)
+        share = min(max((k - at[after - 1]) / (at[after] - at[after - 1]), 0.0), 1.0)
+        mixed = planes[after - 1] * (1 - share) + planes[after] * share
+        out[k] = np.round(mixed) if planes.dtype.kind in "iu" else mixed
+    return out
