@@ -123,7 +123,7 @@ def _chosen(frames: Sequence[Frame], wanted: Wanted, sources: dict[Path, Source]
     planes, heard = planes_of(stack, sources, wanted)
     values, slope, intercept = scaled(planes, stack)
     values = on_lattice(values, stack).transpose(2, 1, 0)
-    return Stored(values, stack.origin, stack.steps, slope, intercept, "mm", notes=(*notes, *stack.notes, *heard))
+    return Stored(values, stack.origin, stack.steps, slope, intercept, unit="mm", notes=(*notes, *stack.notes, *heard))
 
 
 def _series(frames: Sequence[Frame], wanted: Wanted) -> tuple[list[Frame], list[Note]]:
