@@ -208,7 +208,8 @@ def _wall_texture(rows: int, quad: Quad, answer: Samples) -> WallTexture:
     texel = np.linalg.norm(quad.edge_v) / nv, np.linalg.norm(quad.edge_u) / nu
     # Another row is another setting of the sweep: look there last.
     spacing = (1e3 * max(texel) * max(nu, nv), *texel)
-    return WallTexture(fill_holes(spacing, answer.mean.reshape(rows, nv, nu, 3), support), support)
+    light = fill_holes(spacing, answer.light.reshape(rows, nv, nu, -1), support)
+    return WallTexture(light, support, answer.channels)
 
 
 def holes_within_range(scene: Scene, field: int, grid: IlluminationGrid) -> int:

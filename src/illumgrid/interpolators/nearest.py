@@ -24,7 +24,7 @@ class Nearest:
         from scipy.spatial import KDTree
 
         spec, good = nodes.spec, samples[samples.paths > 0]
-        light = np.zeros((len(nodes), samples.mean.shape[1]), np.float32)
+        light = np.zeros((len(nodes), samples.light.shape[1]), np.float32)
         error = np.full(len(nodes), np.inf, np.float32)
         support = np.zeros(len(nodes), np.float32)
         if len(good):
@@ -34,10 +34,10 @@ class Nearest:
             for block in nodes.blocks(np.flatnonzero(near_samples(spec, good.queries.point, reach)), _SLAB):
                 distance, sample = tree.query(block.point - spec.origin, distance_upper_bound=reach)
                 near = np.isfinite(distance)
-                light[block.flat[near]] = good.mean[sample[near]]
+                light[block.flat[near]] = good.light[sample[near]]
                 error[block.flat[near]] = own_error[sample[near]]
                 support[block.flat[near]] = 1.0
-        return nodes.grid(light, error, support)
+        return nodes.grid(light, error, support, samples.channels)
 
 
 @hookimpl

@@ -72,7 +72,7 @@ def sites(samples: Samples, nodes: Nodes) -> Sites:
     paths = good.paths.astype(float)
     total = np.asarray(np.bincount(group, paths, count), float)
     share = paths / total[group]
-    mean: Floats = np.stack([np.bincount(group, share * light, count) for light in good.mean.T], axis=1)
+    mean: Floats = np.stack([np.bincount(group, share * light, count) for light in good.light.T], axis=1)
     variance = np.asarray(np.bincount(group, np.square(share * good.error), count), float)
     levels = np.unique(good.queries.level[:, nodes.number])
     sheet = np.searchsorted(levels, good.queries.level[first, nodes.number]) % 2
@@ -138,7 +138,7 @@ def filled(
     weigh : callable
         Weights (m, k) that add up to 1, 0 for a missing neighbour, and values (m, C).
     """
-    light = np.zeros((len(nodes), samples.mean.shape[1]), np.float32)
+    light = np.zeros((len(nodes), samples.light.shape[1]), np.float32)
     error, support = np.full(len(nodes), np.inf, np.float32), np.zeros(len(nodes), np.float32)
     places = sites(samples, nodes)
     for around in neighbours(places, nodes, count):
@@ -148,4 +148,4 @@ def filled(
         square = np.square(weight)
         error[around.node] = np.sqrt((square * spread).sum(axis=1))
         support[around.node] = 1 / square.sum(axis=1)
-    return nodes.grid(light, error, support)
+    return nodes.grid(light, error, support, samples.channels)
