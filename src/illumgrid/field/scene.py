@@ -1,4 +1,4 @@
-"""What is lit: fields and their materials, and the light from everywhere outside."""
+"""What is lit: fields, quads and their materials, and the background light."""
 
 from dataclasses import dataclass, field
 
@@ -27,9 +27,9 @@ class Material:
     Parameters
     ----------
     albedo : (3,) array_like
-        Share of the light that is reflected, linear RGB, 0 to 1.
+        Fraction of the light that is reflected, linear RGB, 0 to 1.
     emission : (3,) array_like
-        Radiance that leaves the surface by itself, linear RGB.
+        Emitted radiance, linear RGB.
     """
 
     albedo: Floats = field(default_factory=lambda: np.full(3, 0.8))
@@ -41,15 +41,15 @@ class Material:
 
 
 def suggest_range(volume: Volume, inside: Side = "above") -> tuple[float, float, str]:
-    """Isovalues worth sweeping, and why, from the histogram.
+    """Suggest a range of isovalues from the histogram, with the reason.
 
     Returns
     -------
     low, high : float
-        Otsu's threshold parts background from object; the other end leaves the inmost half of the object inside.
-        With `inside` "below" the same is done for -h.
+        One end is Otsu's threshold between background and object; the other leaves the innermost half of the object
+        inside. With `inside` "below" the same is done for -h.
     why : str
-        One sentence that says so, with the numbers.
+        The reason, one sentence with the numbers.
 
     Raises
     ------
@@ -62,7 +62,8 @@ def suggest_range(volume: Volume, inside: Side = "above") -> tuple[float, float,
     """
     from skimage.filters import threshold_otsu
 
-    # np.float64, not float: NumPy keeps the edges of float32 values in float32, too few of them far from zero.
+    # np.float64, not float: for float32 values NumPy would compute the edges in float32, which is too coarse far from
+    # 0.
     lowest, highest = np.float64(np.nanmin(volume.values)), np.float64(np.nanmax(volume.values))
     if not (np.isfinite(lowest) and np.isfinite(highest)):
         volume = finite(volume, inside)
@@ -76,14 +77,14 @@ def suggest_range(volume: Volume, inside: Side = "above") -> tuple[float, float,
     sign = UPWARD[inside]
     threshold = float(threshold_otsu(hist=(counts, depth)))
     within = np.where(depth > threshold, counts, 0)
-    # The bin at which half of the object is passed; at least one bin deeper than the threshold.
+    # The bin that contains the median of the object, at least one bin deeper than the threshold.
     deep = float(
         depth[max(np.searchsorted(np.cumsum(within), 0.5 * within.sum()), np.searchsorted(depth, threshold) + 1)]
     )
     share = within.sum() / counts.sum()
     low, high = sorted((sign * threshold, sign * deep))
     why = (
-        f"Otsu's threshold {sign * threshold:.4g} parts the object ({share:.1%} of the voxels) from the background, "
+        f"Otsu's threshold {sign * threshold:.4g} separates object ({share:.1%} of the voxels) and background, "
         f"and half of the object lies {inside} {sign * deep:.4g}"
     )
     return low, high, why
@@ -100,7 +101,7 @@ class Field:
         Voxels that are not finite are replaced, with a warning (see `illumgrid.field.volume.finite`).
     material : Material
     range : (2,) array_like, optional
-        Lowest and highest isovalue that the user may sweep; by default as `suggest_range` says.
+        Lowest and highest isovalue of the sweep; by default those of `suggest_range`.
     inside : {"above", "below"}
         Which side of the level set is solid: h >= c or h <= c.
     """
@@ -119,7 +120,7 @@ class Field:
         volume = finite(self.volume, self.inside)
         asked = suggest_range(volume, self.inside)[:2] if self.range is None else self.range
         limits = np.array(asked, dtype=float)
-        largest = np.finfo(np.float32).max  # of any value of a volume
+        largest = np.finfo(np.float32).max  # volumes are float32
         if limits.shape != (2,) or not -largest <= limits[0] < limits[1] <= largest:
             raise BadInput(
                 f"the range of field {self.name!r} is {np.asarray(asked).tolist()}; expected a low and a high isovalue"
@@ -136,12 +137,12 @@ class Field:
 
     @property
     def upward(self) -> float:
-        """+1 or -1: what turns h and its isovalues so that the solid is where values are high."""
+        """+1 or -1: the sign for h and its isovalues with which the solid is where values are high."""
         return UPWARD[self.inside]
 
     @property
     def widest(self) -> float:
-        """Isovalue of the range whose solid is largest: those of all others lie within it."""
+        """Isovalue of the range with the largest solid, which contains the solids of all others."""
         return float(self.range[0] if self.upward > 0 else self.range[1])
 
     def solid(self, values: ArrayLike, isovalues: ArrayLike) -> NDArray[np.bool_]:
@@ -149,7 +150,7 @@ class Field:
         return np.asarray(self.upward * np.asarray(values) >= self.upward * np.asarray(isovalues))
 
     def place(self, isovalues: ArrayLike) -> Floats:
-        """Place of isovalues in the sweep: 0 at the low end of the range, 1 at the high end, not clamped."""
+        """Position of isovalues in the sweep: 0 at the low end of the range, 1 at the high end, not clamped."""
         low, high = self.range
         return np.asarray((np.asarray(isovalues, float) - low) / (high - low))
 
@@ -158,16 +159,16 @@ class Field:
 class Quad:
     """A parallelogram: a wall, a floor, a luminaire.
 
-    It reflects on both sides and emits on its front only, the side of edge_u × edge_v in the world.
+    It reflects on both sides and emits on its front only: the side of edge_u × edge_v in the world.
 
     Parameters
     ----------
     name : str
     corner, edge_u, edge_v : (3,) array_like
-        World position of one corner, and the two edges from there.
+        World position of one corner, and the two edges that start there.
     material : Material
     texels : (2,) tuple of int
-        Texels of its light along edge_u and edge_v.
+        Resolution of its light texture along edge_u and edge_v.
     """
 
     name: str
@@ -213,7 +214,7 @@ class Levels:
     Parameters
     ----------
     table : (K, F) float64
-        Isovalue of each field; every column strictly monotone.
+        Isovalue of each field; every column is strictly monotone.
     """
 
     table: Floats
@@ -221,20 +222,20 @@ class Levels:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Everything that the light meets.
+    """All surfaces and lights of a computation.
 
     Parameters
     ----------
     fields : sequence of Field
-        At least one; their axes are parallel (equal `direction`), their names differ.
+        At least one; their axes are parallel (equal `direction`), their names unique.
     quads : sequence of Quad
-        Walls, floors, luminaires; their names differ from one another and from those of the fields.
+        Walls, floors, luminaires; their names are unique, also among those of the fields.
     background : (3,) array_like
-        Constant radiance from everywhere outside, linear RGB.
+        Constant radiance from all directions outside, linear RGB.
 
     Notes
     -----
-    A scene is computed in one frame: the axes of its first field, from its origin. `to_frame` and `from_frame` convert.
+    Computations use the frame of the first field: its axes and its origin. `to_frame` and `from_frame` convert.
     """
 
     fields: tuple[Field, ...]
@@ -297,7 +298,7 @@ class Scene:
         inside: Side = "above",
         name: str = "field",
     ) -> "Scene":
-        """One field in a closed box, red wall left, green right, a luminaire at the bottom (the paper's Figure 5)."""
+        """One field in a closed box: red wall left, green right, a luminaire at the bottom (the paper's Figure 5)."""
         fields = cls.sky(volume, albedo, range, inside, name).fields
         return cls(fields, box_around(volume))
 
@@ -308,7 +309,7 @@ class Scene:
         return np.asarray((1 - share) * low + share * high)
 
     def levels_through(self, field: int, isovalues: ArrayLike) -> Floats:
-        """Settings (n, F) with field number `field` at `isovalues` (n,), the others as the common sweep has them."""
+        """Settings (n, F) with field number `field` at `isovalues` (n,), and the other fields at the same sweep position."""
         own = np.atleast_1d(np.asarray(isovalues, float))
         rows = self.levels(self.fields[field].place(own))
         rows[:, field] = own
@@ -331,7 +332,7 @@ class Scene:
         Raises
         ------
         BadInput
-            If no field has it.
+            If no field has this name.
         """
         names = [f.name for f in self.fields]
         if name is None:
@@ -341,20 +342,20 @@ class Scene:
         return names.index(name)
 
 
-MOST_LEVELS = 2**20  # rows of a level table: far more than any grid tells apart
+MOST_LEVELS = 2**20  # rows of a level table: far more than any grid resolves
 
 
 def level_table(scene: Scene, count: int) -> Levels:
     """`count` equal steps of the common sweep, both ends included."""
     if not 2 <= count <= MOST_LEVELS:
-        raise BadInput(f"{count} isovalues were asked for; expected at least 2 and at most {MOST_LEVELS}")
+        raise BadInput(f"the number of isovalues is {count}; expected at least 2 and at most {MOST_LEVELS}")
     return Levels(scene.levels(np.linspace(0.0, 1.0, count)))
 
 
 def upright(direction: Floats) -> tuple[Floats, Floats, Floats]:
-    """World directions (3,) right, front, up along the axes of an array with this `direction`, in either sense.
+    """World directions (3,) right, front and up: signed axes of an array with this `direction`.
 
-    Up is the axis nearest to world +z, front the one of the others nearest to -y (the face, in medical coordinates).
+    Up is the axis nearest to world +z, front the remaining axis nearest to -y (the face, in medical coordinates).
     """
     heights = direction[2]
     vertical = int(np.argmax(np.abs(heights)))
@@ -374,12 +375,12 @@ def _upright_box(volume: Volume) -> tuple[Floats, Floats, Floats, Floats, Floats
 
 
 def _wall(name: str, centre: Floats, u: Floats, v: Floats, albedo: Floats, texels: tuple[int, int]) -> Quad:
-    """Parallelogram with half edges u and v about its centre; its front is u × v."""
+    """Parallelogram with half edges u and v around its centre; its front is u × v."""
     return Quad(name, centre - u - v, 2 * u, 2 * v, Material(albedo), texels)
 
 
 def box_around(volume: Volume, margin: float = 0.25) -> tuple[Quad, ...]:
-    """Six walls that look inward at a volume, and a luminaire close above the floor; `margin` in half extents."""
+    """Six inward-facing walls around a volume, and a luminaire close above the floor; `margin` in half extents."""
     right, front, up, centre, half = _upright_box(volume)
     half = half + margin * half.max()
     r, f, u = right * half[0], front * half[1], up * half[2]

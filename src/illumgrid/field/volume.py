@@ -1,6 +1,6 @@
 """A scalar field on a lattice of voxels, placed in the world.
 
-Between its voxels a volume is trilinear. Every level set in this package is one of the trilinear interpolant.
+Between voxels a volume is trilinear. Every level set in this package is a level set of the trilinear interpolant.
 """
 
 from collections.abc import Iterator
@@ -16,15 +16,15 @@ Floats = NDArray[np.float64]
 Side = Literal["above", "below"]
 
 UPWARD: dict[Side, float] = {"above": 1.0, "below": -1.0}
-"""The sign that turns a field so that its solid is where values are high: the solid of c is {UPWARD h >= UPWARD c}."""
+"""The sign with which a field's solid is where values are high: the solid of c is {UPWARD h >= UPWARD c}."""
 
 ON_A_VOXEL = 1e-7
-"""Index coordinates this close to an integer are that integer: a node on a voxel stays one after a trip through world
-coordinates, also at origins 1e5 extents away (1e5 x 128 voxels x 2.2e-16 = 3e-9)."""
+"""Index coordinates this close to an integer are rounded to it: a node on a voxel remains there after a round trip
+through world coordinates, even at origins 1e5 extents away (1e5 x 128 voxels x 2.2e-16 = 3e-9)."""
 
 
 class Lattice(Protocol):
-    """Anything placed in the world by origin, spacing and direction: a Volume, a GridSpec."""
+    """Points on a lattice with origin, spacing and direction in the world: a Volume, a GridSpec."""
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -56,12 +56,12 @@ def world_to_index(lattice: Lattice, points: ArrayLike) -> Floats:
 
 
 def placement(origin: ArrayLike, spacing: ArrayLike, direction: ArrayLike) -> tuple[Floats, Floats, Floats]:
-    """Check where a lattice lies; the direction comes back exactly orthonormal.
+    """Validate the placement of a lattice; the returned direction is exactly orthonormal.
 
     Raises
     ------
     BadInput
-        On anything that is not a finite origin, a positive spacing and an orthonormal direction (within 1e-3).
+        Unless the origin is finite, the spacing positive and the direction orthonormal (within 1e-3).
     """
     at, step, axes = (np.array(x, dtype=float) for x in (origin, spacing, direction))
     if at.shape != (3,) or not np.isfinite(at).all():
@@ -72,7 +72,7 @@ def placement(origin: ArrayLike, spacing: ArrayLike, direction: ArrayLike) -> tu
         raise BadInput(f"direction is {axes.tolist()}; expected a 3x3 matrix whose columns are orthonormal")
     u, _, v = np.linalg.svd(axes)
     nearest = u @ v
-    # What is orthonormal to rounding stays as it is, so that a volume survives any number of round trips to disk.
+    # A direction that is orthonormal up to rounding is kept, so that round trips to disk do not change a volume.
     return at, step, axes if np.abs(axes @ axes.T - np.eye(3)).max() < 1e-14 else nearest
 
 
@@ -94,7 +94,7 @@ class Volume:
     Raises
     ------
     BadInput
-        If the values are not real, not 3D, too few, or none of them is finite; or on a bad placement.
+        If the values are not real, not 3D, too few, or all not finite; or if the placement is invalid.
     """
 
     values: NDArray[np.float32]
@@ -108,7 +108,7 @@ class Volume:
             raise BadInput(f"the values have dtype {values.dtype}; expected real numbers")
         if values.ndim != 3 or min(values.shape) < 2:
             raise BadInput(f"the values have shape {values.shape}; expected three axes of at least 2 voxels each")
-        with np.errstate(over="ignore"):  # a float64 beyond float32 becomes an infinity, which is handled as one
+        with np.errstate(over="ignore"):  # a float64 beyond float32 becomes infinite, which is handled
             single = np.ascontiguousarray(values, dtype=np.float32).view()
         if not np.isfinite(single).any():
             raise BadInput("the values are all NaN or infinite; expected finite numbers")
@@ -138,7 +138,7 @@ class Volume:
 
 
 def finite(volume: Volume, inside: Side) -> Volume:
-    """Replace what is not a number, with a warning: NaN by the value farthest outside, ±inf by the finite extremes."""
+    """Replace non-finite values, with a warning: NaN by the value farthest outside, ±inf by the finite extremes."""
     good = np.isfinite(volume.values)
     if good.all():
         return volume
@@ -156,9 +156,9 @@ def finite(volume: Volume, inside: Side) -> Volume:
 
 
 def smooth(volume: Volume, sigma: float) -> Volume:
-    """Blur by a Gaussian of `sigma` voxels (for noisy data); 0 changes nothing."""
+    """Blur by a Gaussian with a standard deviation of `sigma` voxels (for noisy data); 0 changes nothing."""
     longest = max(volume.shape)
-    if not 0 <= sigma <= longest:  # a blur beyond that leaves nothing, and its kernel may exceed any memory
+    if not 0 <= sigma <= longest:  # a larger blur leaves nothing, and its kernel may exceed the memory
         raise BadInput(f"smoothing by {sigma} voxels; expected a number from 0 to {longest}, the longest axis")
     if sigma == 0:
         return volume
@@ -168,7 +168,7 @@ def smooth(volume: Volume, sigma: float) -> Volume:
 
 
 def cells(volume: Lattice, index: Floats) -> tuple[NDArray[np.int64], Floats]:
-    """Cell (n, 3) that holds each fractional index (n, 3), and the position within it, 0 to 1."""
+    """Cell (n, 3) that contains each fractional index (n, 3), and the position within it, 0 to 1."""
     cell = np.clip(np.floor(index), 0, np.array(volume.shape) - 2).astype(np.int64)
     return cell, np.clip(index - cell, 0.0, 1.0)
 
@@ -186,14 +186,14 @@ def box_corners(lattice: Lattice) -> Floats:
 
 
 def interpolate(volume: Volume, index: Floats) -> Floats:
-    """Trilinear value (n,) at fractional indices (n, 3); beyond the border, that of the border."""
+    """Trilinear values (n,) at fractional indices (n, 3), which are clamped to the border."""
     from scipy.ndimage import map_coordinates
 
     return np.asarray(map_coordinates(volume.values, index.T, output=np.float64, order=1, mode="nearest"))
 
 
 def cell_gradient(volume: Volume, index: Floats) -> Floats:
-    """Gradient (n, 3), per world unit along the volume's axes, of the trilinear cell that holds each index (n, 3)."""
+    """Gradient (n, 3) of the trilinear cell that contains each index (n, 3), per world unit along the volume's axes."""
     cell, f = cells(volume, index)
     result = np.zeros((len(index), 3))
     for corner in np.ndindex(2, 2, 2):
@@ -220,9 +220,9 @@ def smooth_gradient(volume: Volume, index: Floats) -> Floats:
 
 
 def outward_normals(volume: Volume, index: Floats, inside: Side) -> Floats:
-    """Unit gradient normals (n, 3) along the volume's axes, towards the outside; (0, 0, 0) on a plateau.
+    """Unit gradient normals (n, 3) along the volume's axes, pointing outside; (0, 0, 0) on a plateau.
 
-    Where the central differences cancel, the normal of the trilinear cell stands in.
+    Where the central differences cancel, the normal of the trilinear cell is used.
     """
     gradient = smooth_gradient(volume, index)
     flat = ~gradient.any(axis=1)
@@ -237,7 +237,8 @@ def outward_normals(volume: Volume, index: Floats, inside: Side) -> Floats:
 
 
 _MET = 1e-10
-"""Newton steps this short, in index coordinates, end a projection; the last of them is still taken, and squares it."""
+"""Newton steps below this length, in index coordinates, end a projection; the last step is still taken, and convergence
+is quadratic."""
 
 
 def project(volume: Volume, index: Floats, isovalues: Floats) -> tuple[Floats, NDArray[np.bool_]]:
@@ -259,14 +260,14 @@ def project(volume: Volume, index: Floats, isovalues: Floats) -> tuple[Floats, N
         here = at[moving]
         miss = isovalues[moving] - interpolate(volume, here)
         slope = cell_gradient(volume, here)
-        for axis in range(3):  # across a plane of voxels this component jumps: the mean of both cells favours neither
+        for axis in range(3):  # this component jumps across a plane of voxels: take the mean of both cells
             on = (here[:, axis] == np.floor(here[:, axis])) & (here[:, axis] > 0) & (here[:, axis] < top[axis])
             if on.any():
                 before = here[on]
                 before[:, axis] = np.nextafter(before[:, axis], 0.0)
                 slope[on, axis] = 0.5 * (slope[on, axis] + cell_gradient(volume, before)[:, axis])
         flat = ~slope.any(axis=1)
-        if flat.any():  # at the edge of a plateau the way out is known to the central differences only
+        if flat.any():  # at the edge of a plateau only the central differences point outwards
             slope[flat] = smooth_gradient(volume, here[flat])
         slope *= volume.spacing  # per index step
         largest = np.abs(slope).max(axis=1, initial=0.0)
@@ -276,10 +277,10 @@ def project(volume: Volume, index: Floats, isovalues: Floats) -> tuple[Floats, N
         step *= np.divide(miss / np.where(largest > 0, largest, 1.0), (step * step).sum(axis=1), where=largest > 0,
                           out=np.zeros_like(miss))[:, None]  # fmt: skip
         length = np.abs(step).max(axis=1, initial=0.0)
-        # Where the set is met, the step is rounding; where there is no slope, it never will be.
+        # On the level set, only rounding remains of the step; without a slope, the set cannot be reached.
         there = (length < _MET) & (largest > 0) | (miss == 0)
         arrived[moving[(largest == 0) & (miss != 0)]] = False
-        # Across a kink between two cells full steps can swing to and fro: halve those that did not shrink.
+        # Across a kink between two cells full steps can oscillate: halve those that did not shrink.
         step *= np.where(length >= last[moving], 0.5, 1.0)[:, None]
         step *= np.minimum(1.0, 0.5 / np.maximum(length, 1e-300))[:, None]
         last[moving] = np.minimum(last[moving], length)

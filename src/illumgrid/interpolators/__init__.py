@@ -1,1 +1,1 @@
-"""From scattered answers to a uniform grid: one file an interpolator."""
+"""Interpolators, from scattered samples to a uniform grid: one file per interpolator."""

@@ -1,4 +1,4 @@
-"""Each node takes the answer of the sample nearest to it."""
+"""Each node takes the light of the nearest sample."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -10,12 +10,12 @@ from illumgrid.interpolators.neighbours import diagonal, near_samples
 from illumgrid.stages import Interpolator, hookimpl
 from illumgrid.transport.samples import Samples
 
-_SLAB = 1 << 18  # nodes asked at once: bounds the memory of a search
+_SLAB = 1 << 18  # nodes per search: bounds the memory
 
 
 @dataclass(frozen=True)
 class Nearest:
-    """The nearest sample within a cell's diagonal, holes passed over; nodes beyond are holes."""
+    """The nearest sample within a cell's diagonal, ignoring holes; nodes farther away are holes."""
 
     name: ClassVar[str] = "nearest"
 
@@ -28,7 +28,7 @@ class Nearest:
         error = np.full(len(nodes), np.inf, np.float32)
         support = np.zeros(len(nodes), np.float32)
         if len(good):
-            # Distances from the grid's origin: far from the world's, differences of large numbers would lose digits.
+            # Coordinates relative to the grid's origin: differences of large world coordinates would lose digits.
             tree = KDTree(good.queries.point - spec.origin)
             reach, own_error = diagonal(spec), good.error
             for block in nodes.blocks(np.flatnonzero(near_samples(spec, good.queries.point, reach)), _SLAB):
@@ -42,5 +42,5 @@ class Nearest:
 
 @hookimpl
 def register_interpolators() -> list[type[Interpolator]]:
-    """Name this file's stage to the registry, as a plugin does."""
+    """Register the stage of this file, as a plugin does."""
     return [Nearest]

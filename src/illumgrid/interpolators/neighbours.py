@@ -1,4 +1,4 @@
-"""The samples that a node rests upon: the nearest ones, of both level sets that it lies between."""
+"""The samples behind a node: the nearest ones on both level sets that it lies between."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -11,40 +11,40 @@ from illumgrid.field.volume import Floats, world_to_index
 from illumgrid.grid import GridSpec, IlluminationGrid, Nodes
 from illumgrid.transport.samples import Samples
 
-_SLAB = 1 << 16  # nodes asked at once: bounds the memory of a search
-_ONE_PLACE = 1e-6  # of a node spacing: samples so close are one
+_SLAB = 1 << 16  # nodes per search: bounds the memory
+_ONE_PLACE = 1e-6  # of a node spacing: closer samples are merged
 BETWEEN = 4.0
-"""Cell diagonals from the nearest sample within which a node between two level sets is in reach."""
+"""Reach of a node between two level sets: distance to the nearest sample, in cell diagonals."""
 
 
 def diagonal(spec: GridSpec) -> float:
-    """Diagonal of a grid cell, a little longer than rounding can make it: the reach of a sample."""
+    """Diagonal of a grid cell plus a margin for rounding: the reach of a sample."""
     return float(np.linalg.norm(spec.spacing)) * (1 + 1e-6)
 
 
 def near_samples(spec: GridSpec, points: Floats, reach: float) -> NDArray[np.bool_]:
-    """Nodes (nx, ny, nz) in whose box of half-width `reach` there may be one of the world points (n, 3)."""
+    """Nodes (nx, ny, nz) that may have one of the world points (n, 3) in their box of half-width `reach`."""
     from scipy.ndimage import maximum_filter
 
     taken = np.zeros(spec.shape, bool)
     closest = np.clip(np.round(world_to_index(spec, points)), 0, np.array(spec.shape) - 1).astype(np.int64)
     taken[tuple(closest.T)] = True
-    # A point is at most half a node from the one that it is rounded to.
+    # A point is at most half a node spacing from the node that it is rounded to.
     width = 2 * np.ceil(reach / spec.spacing + 0.5).astype(int) + 1
     return np.asarray(maximum_filter(taken, size=tuple(width), mode="constant"))
 
 
 @dataclass(frozen=True, eq=False)
 class Sites:
-    """Places (n, ...) with an answer each.
+    """Distinct points with their light.
 
     Parameters
     ----------
     point : (n, 3) float64
-        From the grid's origin, along the world's axes: far from the world's origin, differences would lose digits.
+        Relative to the grid's origin, along the world's axes: differences of large world coordinates would lose digits.
     normal : (n, 3) float64
     sheet : (n,) int64
-        0 or 1: neighbouring isovalues of the run differ in it.
+        0 or 1, alternating over the isovalues of the run.
     mean, variance : (n, C), (n,) float64
     paths : (n,) float64
     """
@@ -58,7 +58,7 @@ class Sites:
 
 
 def sites(samples: Samples, nodes: Nodes) -> Sites:
-    """Answers that are no holes; those at one place are merged, each weighted by its paths."""
+    """Samples that are not holes; coincident ones are merged, weighted by their paths."""
     spec, good = nodes.spec, samples[samples.paths > 0]
     point = good.queries.point - spec.origin
     place = np.round(point / (_ONE_PLACE * spec.spacing.min())).astype(np.int64)
@@ -80,21 +80,21 @@ def sites(samples: Samples, nodes: Nodes) -> Sites:
 
 
 class Neighbours(NamedTuple):
-    """Sites around nodes in reach: m nodes, k neighbours each, in no order."""
+    """Sites around nodes within reach: m nodes, k neighbours each, in no particular order."""
 
     node: NDArray[np.integer]  # (m,) flat numbers
-    point: Floats  # (m, 3) from the grid's origin
+    point: Floats  # (m, 3) relative to the grid's origin
     site: NDArray[np.int64]  # (m, k)
-    distance: Floats  # (m, k); infinite: none
+    distance: Floats  # (m, k); infinite for a missing neighbour
     between: NDArray[np.bool_]  # (m,) in front of the nearest site of one sheet, behind that of the other
 
 
 def neighbours(places: Sites, nodes: Nodes, count: int) -> Iterator[Neighbours]:
-    """Up to `count` neighbours of each node in reach: half of each sheet, so that a near one does not hide the other.
+    """Up to `count` neighbours of each node within reach, half from each sheet so that neither hides the other.
 
-    Sites that face away from the nearest one belong to another surface, the back of a slab or the wall across a cleft,
-    whose light is not this one's: they are left out. In reach is a node within a cell's diagonal of a site, or one that
-    lies in front of the nearest site of one sheet and behind that of the other, within `BETWEEN` diagonals.
+    Sites that face away from the nearest one are left out: they belong to another surface with different light, such as
+    the back of a slab or the wall across a cleft. A node is within reach if a site lies within a cell's diagonal, or if
+    it lies in front of the nearest site of one sheet and behind that of the other, within `BETWEEN` diagonals.
     """
     from scipy.spatial import KDTree
 
@@ -108,9 +108,9 @@ def neighbours(places: Sites, nodes: Nodes, count: int) -> Iterator[Neighbours]:
         distance, site = np.full((len(node), len(trees), each), np.inf), np.zeros((len(node), len(trees), each), int)
         for number, (member, tree) in enumerate(zip(members, trees)):
             asked = range(1, min(each, len(member)) + 1)
-            apart, which = tree.query(point, asked, distance_upper_bound=2 * BETWEEN * near, workers=-1)
-            distance[:, number, : len(asked)] = apart
-            site[:, number, : len(asked)] = member[np.where(np.isfinite(apart), which, 0)]
+            found, which = tree.query(point, asked, distance_upper_bound=2 * BETWEEN * near, workers=-1)
+            distance[:, number, : len(asked)] = found
+            site[:, number, : len(asked)] = member[np.where(np.isfinite(found), which, 0)]
         rows = np.arange(len(node))
         closest = distance[:, :, 0].argmin(axis=1)
         facing = places.normal[site[rows, closest, 0]]
@@ -129,21 +129,21 @@ def neighbours(places: Sites, nodes: Nodes, count: int) -> Iterator[Neighbours]:
 def filled(
     samples: Samples, nodes: Nodes, count: int, weigh: Callable[[Sites, Neighbours], tuple[Floats, Floats]]
 ) -> IlluminationGrid:
-    """Grid whose nodes are weighted sums of neighbours.
+    """Grid whose nodes are weighted sums of their neighbours.
 
     Parameters
     ----------
     count : int
-        Neighbours of a node.
+        Maximum number of neighbours per node.
     weigh : callable
-        Weights (m, k) that add up to 1, 0 for a missing neighbour, and values (m, C).
+        Returns weights (m, k) that add up to 1, with 0 for a missing neighbour, and values (m, C).
     """
     light = np.zeros((len(nodes), samples.light.shape[1]), np.float32)
     error, support = np.full(len(nodes), np.inf, np.float32), np.zeros(len(nodes), np.float32)
     places = sites(samples, nodes)
     for around in neighbours(places, nodes, count):
         weight, light[around.node] = weigh(places, around)
-        # As of independent samples. Where one has no error of its own (a single path), the node has none either.
+        # Samples count as independent. If one has no known error (a single path), the node has none either.
         spread = np.where(weight != 0, places.variance[around.site], 0.0)
         square = np.square(weight)
         error[around.node] = np.sqrt((square * spread).sum(axis=1))

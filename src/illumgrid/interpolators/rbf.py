@@ -26,7 +26,7 @@ def _spline_values(places: Sites, around: Neighbours) -> tuple[Floats, Floats]:
             weight[rows], value[rows], steps[rows],
         )  # fmt: skip
 
-    chunk(slice(0, 0))  # compiles once, in the main thread, which Ctrl-C interrupts
+    chunk(slice(0, 0))  # compiles in the main thread, where Ctrl-C can interrupt it
     size = 1 << 12
     with ThreadPoolExecutor() as pool:
         list(pool.map(chunk, (slice(i, i + size) for i in range(0, len(around.node), size))))
@@ -35,12 +35,12 @@ def _spline_values(places: Sites, around: Neighbours) -> tuple[Floats, Floats]:
 
 @dataclass(frozen=True)
 class Rbf:
-    """Local biharmonic splines with a linear tail, held within the range of their samples.
+    """Local biharmonic splines with a linear tail, clamped to the range of their samples.
 
     Parameters
     ----------
     neighbours : int
-        Samples that a node rests upon, at most.
+        Maximum number of samples per node.
 
     References
     ----------
@@ -64,5 +64,5 @@ class Rbf:
 
 @hookimpl
 def register_interpolators() -> list[type[Interpolator]]:
-    """Name this file's stage to the registry, as a plugin does."""
+    """Register the stage of this file, as a plugin does."""
     return [Rbf]

@@ -14,15 +14,15 @@ from illumgrid.transport.samples import Samples
 
 
 def _kernel_means(places: Sites, around: Neighbours) -> tuple[Floats, Floats]:
-    """Weights of Wendland's kernel on either sheet, the sheets in inverse proportion to their distance, and the means.
+    """Weights of Wendland's kernel on each sheet, the sheets weighted inversely to their distance, and the means.
 
-    Paths count too, but not the variance: it is estimated from the same paths as the mean, and dark estimates, which
-    vary least, would win.
+    Weights are proportional to paths, not to inverse variances: the variance is estimated from the same paths as the
+    mean, and dark estimates, which vary least, would dominate.
     """
     weight = np.zeros(around.site.shape)
     sheet = np.where(np.isfinite(around.distance), places.sheet[around.site], -1)
     nearest = np.stack([np.where(sheet == s, around.distance, np.inf).min(axis=1) for s in (0, 1)], axis=1)
-    # Linear between the sheets; elsewhere the nearer one has all of the node, which is the same on the sheet itself.
+    # Linear between the sheets; elsewhere only the nearer sheet counts, which agrees on the sheet itself.
     share = np.where(around.between[:, None], nearest[:, ::-1], nearest == nearest.min(axis=1, keepdims=True))
     share /= share.sum(axis=1, keepdims=True)
     for number in (0, 1):
@@ -39,13 +39,13 @@ def _kernel_means(places: Sites, around: Neighbours) -> tuple[Floats, Floats]:
 class Splat:
     """Means of the nearest samples on the two level sets around a node, linear between them.
 
-    The mean on a level set is weighted by a kernel as wide as the samples there are apart.
+    The mean on a level set is weighted by a kernel whose width adapts to the spacing of the samples there.
 
     Parameters
     ----------
     neighbours : int
-        Samples that a node rests upon, at most, half of them on each level set; the farthest of those sets the
-        radius of its kernel.
+        Maximum number of samples per node, half of them on each level set. The farthest one on a level set determines
+        the radius of the kernel there.
 
     References
     ----------
@@ -69,5 +69,5 @@ class Splat:
 
 @hookimpl
 def register_interpolators() -> list[type[Interpolator]]:
-    """Name this file's stage to the registry, as a plugin does."""
+    """Register the stage of this file, as a plugin does."""
     return [Splat]

@@ -1,4 +1,4 @@
-"""Compiled: the weights of local biharmonic splines. Serial, no state, the GIL released; threads are the caller's."""
+"""Compiled weights of local biharmonic splines. Serial, stateless, with the GIL released; the caller runs threads."""
 
 import numba
 import numpy as np
@@ -6,8 +6,8 @@ import numpy as np
 jit = numba.njit(cache=True, nogil=True, error_model="numpy")
 
 AMPLIFIES = 2.0
-"""Sum of the sizes of a node's weights above which a ridge is laid: how much it may amplify an error of its samples."""
-_TAIL = 1e-8  # how little the linear tail is held back where there is no ridge: nine digits remain
+"""Sum of |weights| of a node above which a ridge is added: the largest amplification of errors of its samples."""
+_TAIL = 1e-8  # regularisation of the linear tail without a ridge: nine digits remain
 _FIRST_RIDGE, _STEEPER, _LADDER = 1e-2, 10.0, 4
 
 
@@ -16,16 +16,16 @@ def solve_weights(x, ridge, tail, matrix, right, weight):
     """Weights (n,) for the value at the origin of a spline through points x (n, 3), none farther than 1.
 
     They minimise the power function of the biharmonic kernel -|x - y| plus `ridge` |weight|² and |Σ weight x|² / `tail`
-    among those that add up to 1. By Cholesky: a constant added to the kernel changes nothing under that condition, and
-    one above 2 makes the matrix positive definite for points in the unit ball (Hinrichs, Nickolas, Wolf, "A note on the
-    metric geometry of the unit ball", Mathematische Zeitschrift 268, 2011).
+    among weights that add up to 1. Solved by Cholesky decomposition: a constant added to the kernel changes nothing
+    under that condition, and one above 2 makes the matrix positive definite for points in the unit ball (Hinrichs,
+    Nickolas, Wolf, "A note on the metric geometry of the unit ball", Mathematische Zeitschrift 268, 2011).
     """
     n = len(x)
     for i in range(n):
         for j in range(i + 1):
-            apart = np.sqrt((x[i, 0] - x[j, 0]) ** 2 + (x[i, 1] - x[j, 1]) ** 2 + (x[i, 2] - x[j, 2]) ** 2)
+            distance = np.sqrt((x[i, 0] - x[j, 0]) ** 2 + (x[i, 1] - x[j, 1]) ** 2 + (x[i, 2] - x[j, 2]) ** 2)
             moment = x[i, 0] * x[j, 0] + x[i, 1] * x[j, 1] + x[i, 2] * x[j, 2]
-            matrix[i, j] = 3.0 - apart + moment / tail
+            matrix[i, j] = 3.0 - distance + moment / tail
         matrix[i, i] += ridge
         right[i, 0] = 3.0 - np.sqrt(x[i, 0] ** 2 + x[i, 1] ** 2 + x[i, 2] ** 2)
         right[i, 1] = 1.0
@@ -35,7 +35,7 @@ def solve_weights(x, ridge, tail, matrix, right, weight):
         for k in range(j):
             pivot -= matrix[j, k] ** 2
         if not pivot > 1e-13 * own:
-            return False  # two samples as good as coincide
+            return False  # two samples coincide numerically
         matrix[j, j] = np.sqrt(pivot)
         for i in range(j + 1, n):
             total = matrix[i, j]
@@ -64,7 +64,7 @@ def weigh(node, site, distance, point, mean, amplifies, weight, value, steps):
     x, own, used = np.zeros((k, 3)), np.zeros(k), np.zeros(k, np.int64)
     matrix, right = np.zeros((k, k)), np.zeros((k, 2))
     for number in range(m):
-        # The neighbours there are, in a ball of radius 1 around the node.
+        # Scale the existing neighbours into a ball of radius 1 around the node.
         n, nearest, radius = 0, 0, 0.0
         for j in range(k):
             if distance[number, j] < np.inf:
@@ -81,7 +81,7 @@ def weigh(node, site, distance, point, mean, amplifies, weight, value, steps):
         for i in range(n):
             for axis in range(3):
                 x[i, axis] = (point[site[number, used[i]], axis] - node[number, axis]) / radius
-        # No ridge if that will do; else steeper ones, the last of which is as good as a plain mean.
+        # Without a ridge if possible; else with increasing ridges, the last of which amounts to a plain mean.
         ridge, tail, step = 0.0, _TAIL, 0
         while True:
             solved = solve_weights(x[:n], ridge, tail, matrix, right, own)
@@ -96,7 +96,7 @@ def weigh(node, site, distance, point, mean, amplifies, weight, value, steps):
         steps[number] = step
         for i in range(n):
             weight[number, used[i]] = own[i]
-        # Between sheets of different light a spline overshoots: it stays within the range of its neighbours.
+        # Between sheets of different light a spline overshoots: clamp it to the range of its neighbours.
         for c in range(mean.shape[1]):
             low, high, total = np.inf, -np.inf, 0.0
             for i in range(n):

@@ -1,1 +1,1 @@
-"""Where to ask for light: one file a sampler."""
+"""Samplers, which choose the points of the queries: one file per sampler."""

@@ -1,6 +1,6 @@
-"""Isovalues in equal steps of space, closer where the topology changes, and points strewn over each level set.
+"""Isovalues in equal steps of space, denser where the topology changes, and points scattered over each level set.
 
-Neighbouring level sets are a distance dc / |∇h| apart. Its mean over L_c is, by the co-area formula, a ratio of two
+The distance between neighbouring level sets is dc / |∇h|. By the co-area formula, its mean over L_c is a ratio of two
 sums over cells, which need no extraction (Federer, "Curvature measures", Trans. AMS 93, 1959; on histograms and areas
 of level sets: Scheidegger et al., "Revisiting histograms and isosurface statistics", TVCG 14(6), 2008).
 """
@@ -20,16 +20,16 @@ from illumgrid.grid import GridSpec
 from illumgrid.stages import Sampler, hookimpl, on_level_sets
 from illumgrid.transport.samples import Queries
 
-_BINS = 1024  # of the sweep: a field of bytes has a quarter of that many isovalues
-_CELLS = 1 << 18  # measured at once: bounds the memory
+_BINS = 1024  # of the sweep: four times the isovalues of a field of bytes
+_CELLS = 1 << 18  # cells per block: bounds the memory
 TOPOLOGY = 0.1
-"""Share of the levels that is given to changes of topology."""
+"""Share of the levels that is assigned to changes of topology."""
 
 
 def _cells_in_range(field: Field) -> Iterator[tuple[Floats, Floats, Floats]]:
-    """Lowest value, highest value and mean slope (m,) of the cells that the range crosses, some at a time.
+    """Lowest value, highest value and mean slope (m,) of the cells that the range crosses, in blocks.
 
-    The mean is that of |∇h| at the 8 Gauss points of the trilinear cell: at the middle alone it may vanish.
+    The slope is the mean of |∇h| over the 8 Gauss points of the trilinear cell: at the centre alone it may vanish.
     """
     values = field.volume.values
     rows = max(1, _CELLS // (values.shape[1] * values.shape[2]))
@@ -51,16 +51,17 @@ def _cells_in_range(field: Field) -> Iterator[tuple[Floats, Floats, Floats]]:
 def distance_between(field: Field, edges: Floats) -> Floats:
     """Mean distance (n - 1,), world units, between the level sets of neighbouring isovalues `edges` (n,), increasing.
 
-    It is ∫ 1/|∇h| dA / ∫ dA over the level sets from one edge to the next: dV over ∫ |∇h| dV, both summed over cells,
-    each of which spreads its volume evenly over the isovalues that cross it. So neither the comb of a histogram of
-    whole numbers nor a plateau, whose volume no level set crosses, disturbs it. 0 where there is no level set.
+    The distance is ∫ 1/|∇h| dA / ∫ dA over the level sets from one edge to the next: dV over ∫ |∇h| dV. Both are sums
+    over cells, and each cell spreads its volume evenly over the isovalues that cross it. The result is therefore
+    insensitive to the comb in a histogram of integers and to plateaus, whose volume no level set crosses. It is 0 where
+    there is no level set.
     """
     step = np.diff(edges)
     volume, area = np.zeros((2, len(step)))
     for low, high, slope in _cells_in_range(field):
-        middle, span = 0.5 * (low + high), np.maximum(high - low, step.min())  # a thinner cell would lose digits
+        middle, span = 0.5 * (low + high), np.maximum(high - low, step.min())  # smaller spans would lose digits
         for weight, total in ((1 / span, volume), (slope / span, area)):
-            # Twice the running sum of what begins and ends: ramps, exact at the edges.
+            # The cumulative sum of starts minus that of ends, integrated: ramps, exact at the edges.
             ramps = np.zeros(len(edges))
             for start, sign in ((middle - span / 2, 1.0), (middle + span / 2, -1.0)):
                 bins = np.searchsorted(edges, start, side="right")
@@ -75,9 +76,9 @@ def distance_between(field: Field, edges: Floats) -> Floats:
 def critical_values(field: Field) -> tuple[Floats, NDArray[np.int64]]:
     """Isovalues (m,) within the range at which the topology changes, and by how much (m,), one for each such voxel.
 
-    The solid is taken as the cells of the lattice whose corners all belong to it; a voxel that joins it, as the
-    isovalue passes, changes its Euler characteristic by the alternating sum of the cells that it completes: 0 unless
-    it is critical. Equal values take turns by their place in the array, so that a plateau is one step, not many.
+    The solid consists of the lattice cells whose corners all belong to it. A voxel that joins it, as the isovalue
+    passes, changes the Euler characteristic by the alternating sum of the cells that it completes, which is 0 unless
+    the voxel is critical. Equal values are ordered by their position in the array, so that a plateau counts once.
     """
     values = np.pad(field.upward * field.volume.values, 1, constant_values=-np.inf)
     within = (field.volume.values >= field.range[0]) & (field.volume.values <= field.range[1])
@@ -100,44 +101,44 @@ def critical_values(field: Field) -> tuple[Floats, NDArray[np.int64]]:
 
 
 def adaptive_rows(scene: Scene, count: int, topology: float = TOPOLOGY) -> Floats:
-    """At most `count` rows of levels (K, F), equal steps of space apart for the field that is swept farthest.
+    """At most `count` rows of levels (K, F), in equal steps of space for the field that moves farthest.
 
     Parameters
     ----------
     scene : Scene
     count : int
     topology : float
-        Share of the rows that goes to isovalues at which the topology changes, 0 to 1.
+        Share of the rows that is assigned to isovalues at which the topology changes, 0 to 1.
     """
     sweep = np.linspace(0.0, 1.0, _BINS + 1)
     edges = scene.levels(sweep)
-    apart, changes = np.zeros((2, _BINS))
+    step_length, changes = np.zeros((2, _BINS))
     for number, field in enumerate(scene.fields):
-        apart = np.maximum(apart, distance_between(field, edges[:, number]))
+        step_length = np.maximum(step_length, distance_between(field, edges[:, number]))
         at, change = critical_values(field)
         changes += np.histogram(at, edges[:, number], weights=np.abs(change))[0]
-    if not apart.any():
-        return level_table(scene, count).table  # no cell is crossed: nothing to choose by
-    changes[apart == 0] = 0
-    share = apart / apart.sum()
+    if not step_length.any():
+        return level_table(scene, count).table  # no cell is crossed: no basis for a choice
+    changes[step_length == 0] = 0
+    share = step_length / step_length.sum()
     if changes.any():
         share = (1 - topology) * share + topology * changes / changes.sum()
     reached = np.concatenate([[0.0], share.cumsum()])
-    begin, end = np.flatnonzero(share)[[0, -1]]  # what is empty at the ends of the range gets no row
+    begin, end = np.flatnonzero(share)[[0, -1]]  # empty ends of the range get no row
     inner = np.interp(np.linspace(0, reached[-1], count)[1:-1], reached, sweep)
     return scene.levels(np.unique(np.concatenate([[sweep[begin]], inner, [sweep[end + 1]]])))
 
 
 @dataclass(frozen=True)
 class Adaptive:
-    """Level sets in equal steps of space, closer where the topology changes, points uniform by area on each.
+    """Level sets in equal steps of space, denser where the topology changes, with points uniform by area on each.
 
     Parameters
     ----------
     count : int
-        Number of isovalues, at most.
+        Maximum number of isovalues.
     points : int
-        Points on each level set; 0 takes one for each squared node spacing, at least 64.
+        Points on each level set; 0 selects one per squared node spacing, at least 64.
     """
 
     name: ClassVar[str] = "adaptive"
@@ -149,16 +150,16 @@ class Adaptive:
             raise BadInput(f"adaptive.count is {self.count}; expected at least 2 isovalues")
         if self.points < 0:
             raise BadInput(
-                f"adaptive.points is {self.points}; expected a positive number, or 0 for one a node spacing squared"
+                f"adaptive.points is {self.points}; expected a positive number, or 0 for one per squared node spacing"
             )
 
     def queries(self, scene: Scene, specs: Sequence[GridSpec], seed: int) -> Iterator[Queries]:
-        """Ask on at most `count` rows of the common sweep: see `illumgrid.stages.Sampler`."""
+        """Queries on at most `count` rows of the common sweep: see `illumgrid.stages.Sampler`."""
         rows = adaptive_rows(scene, self.count)
         yield from on_level_sets(scene, rows, seed, specs=specs, points=self.points or None)
 
 
 @hookimpl
 def register_samplers() -> list[type[Sampler]]:
-    """Name this file's stage to the registry, as a plugin does."""
+    """Register the stage of this file, as a plugin does."""
     return [Adaptive]

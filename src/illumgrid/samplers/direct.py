@@ -1,4 +1,4 @@
-"""One question at each node: light decoupled from the extraction of surfaces.
+"""One query at each node: light decoupled from the extraction of surfaces.
 
 Banks and Beason, "Decoupling illumination from isosurface generation using 4D light transport", TVCG 2009.
 """
@@ -34,9 +34,9 @@ def crossed_cells(field: Field) -> NDArray[np.bool_]:
 
 
 def reachable(field: Field, spec: GridSpec) -> NDArray[np.int64]:
-    """Flat numbers of the nodes that a lookup on some isosurface of the field's range can touch.
+    """Flat numbers of the nodes that a lookup on some isosurface of the field's range can read.
 
-    They are the corners of all grid cells that overlap a voxel cell which some level set within the range crosses.
+    These are the corners of all grid cells that overlap a voxel cell crossed by a level set of the range.
     """
     crossed = crossed_cells(field)
     for axis in range(3):
@@ -53,13 +53,13 @@ def reachable(field: Field, spec: GridSpec) -> NDArray[np.int64]:
 
 
 def at_nodes(scene: Scene, field: int, spec: GridSpec, nodes: NDArray[np.integer]) -> Queries:
-    """What `Direct` asks at the nodes with these flat numbers; each has its number as id."""
+    """Queries of `Direct` at the nodes with these flat numbers, which are their ids."""
     own, points = scene.fields[field], spec.nodes(nodes)
     index = world_to_index(own.volume, points)
     isovalues = interpolate(own.volume, index)
-    # A rim node stands for the end of the range: light of a level that no sweep reaches would be wrong there (at the
-    # value of an empty background everything is solid, and dark). A projection goes no farther than a voxel; a node of
-    # a coarser grid goes there over isovalues in between.
+    # A rim node represents the end of the range: light of a level outside the sweep would be wrong there (at the value
+    # of an empty background everything is solid, and dark). A projection moves at most one voxel, so a node of a
+    # coarser grid moves there over intermediate isovalues.
     level = np.clip(isovalues, *own.range)
     rim = np.flatnonzero(level != isovalues)
     steps = int(np.ceil((spec.spacing / own.volume.spacing).max() - 1e-9))
@@ -77,14 +77,14 @@ def at_nodes(scene: Scene, field: int, spec: GridSpec, nodes: NDArray[np.integer
 class Direct:
     """One query on each grid node that a sweep can reach, on the level set through the node itself.
 
-    A node of the rim, whose own isovalue lies outside the range, asks at the nearest end of the range instead, from the
+    A rim node, whose own isovalue lies outside the range, is queried at the nearest end of the range instead, from the
     point of that level set to which the gradient leads.
     """
 
     name: ClassVar[str] = "direct"
 
     def queries(self, scene: Scene, specs: Sequence[GridSpec], seed: int) -> Iterator[Queries]:
-        """Ask at the nodes, each with its flat number as id: see `illumgrid.stages.Sampler`."""
+        """Queries at the nodes, with their flat numbers as ids: see `illumgrid.stages.Sampler`."""
         for number, (field, spec) in enumerate(zip(scene.fields, specs)):
             nodes = reachable(field, spec)
             for first in range(0, len(nodes), _BATCH):
@@ -93,5 +93,5 @@ class Direct:
 
 @hookimpl
 def register_samplers() -> list[type[Sampler]]:
-    """Name this file's stage to the registry, as a plugin does."""
+    """Register the stage of this file, as a plugin does."""
     return [Direct]

@@ -1,4 +1,4 @@
-"""Isovalues in equal steps, and points strewn over each level set: the paper's way."""
+"""Isovalues in equal steps, and points scattered over each level set: the method of the founding paper."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -13,14 +13,14 @@ from illumgrid.transport.samples import Queries
 
 @dataclass(frozen=True)
 class Uniform:
-    """Level sets in equal steps of the isovalue, points uniform by area on each.
+    """Level sets in equal steps of the isovalue, with points uniform by area on each.
 
     Parameters
     ----------
     count : int
         Number of isovalues, both ends of the range included.
     points : int
-        Points on each level set; 0 takes one for each squared node spacing, at least 64.
+        Points on each level set; 0 selects one per squared node spacing, at least 64.
     """
 
     name: ClassVar[str] = "uniform"
@@ -32,16 +32,16 @@ class Uniform:
             raise BadInput(f"uniform.count is {self.count}; expected at least 2 isovalues")
         if self.points < 0:
             raise BadInput(
-                f"uniform.points is {self.points}; expected a positive number, or 0 for one a node spacing squared"
+                f"uniform.points is {self.points}; expected a positive number, or 0 for one per squared node spacing"
             )
 
     def queries(self, scene: Scene, specs: Sequence[GridSpec], seed: int) -> Iterator[Queries]:
-        """Ask on `count` rows of the common sweep: see `illumgrid.stages.Sampler`."""
+        """Queries on `count` rows of the common sweep: see `illumgrid.stages.Sampler`."""
         rows = level_table(scene, self.count).table
         yield from on_level_sets(scene, rows, seed, specs=specs, points=self.points or None)
 
 
 @hookimpl
 def register_samplers() -> list[type[Sampler]]:
-    """Name this file's stage to the registry, as a plugin does."""
+    """Register the stage of this file, as a plugin does."""
     return [Uniform]
