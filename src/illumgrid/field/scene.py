@@ -309,7 +309,7 @@ class Scene:
         return np.asarray((1 - share) * low + share * high)
 
     def levels_through(self, field: int, isovalues: ArrayLike) -> Floats:
-        """Settings (n, F) with field number `field` at `isovalues` (n,), and the other fields at the same sweep position."""
+        """Settings (n, F) with field number `field` at `isovalues` (n,), the others at the same sweep position."""
         own = np.atleast_1d(np.asarray(isovalues, float))
         rows = self.levels(self.fields[field].place(own))
         rows[:, field] = own
@@ -348,7 +348,7 @@ MOST_LEVELS = 2**20  # rows of a level table: far more than any grid resolves
 def level_table(scene: Scene, count: int) -> Levels:
     """`count` equal steps of the common sweep, both ends included."""
     if not 2 <= count <= MOST_LEVELS:
-        raise BadInput(f"the number of isovalues is {count}; expected at least 2 and at most {MOST_LEVELS}")
+        raise BadInput(f"{count} isovalues were requested; expected at least 2 and at most {MOST_LEVELS}")
     return Levels(scene.levels(np.linspace(0.0, 1.0, count)))
 
 
