@@ -24,7 +24,7 @@ from illumgrid import Scene, isosurface
 from illumgrid.field.scene import level_table
 from illumgrid.grid import GridSpec, IlluminationGrid
 from illumgrid.light import Illumination
-from illumgrid.show.render import choose_engine, fit_camera, gl, meshes
+from illumgrid.show import choose_engine, fit_camera, gl, meshes
 from illumgrid.show.shade import BACKGROUND, Shown
 from illumgrid.tone import srgb_curve
 

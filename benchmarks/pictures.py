@@ -15,7 +15,7 @@ from PIL import Image
 import illumgrid as ig
 from illumgrid.field.scene import upright
 from illumgrid.field.volume import index_to_world, smooth
-from illumgrid.show.render import render
+from illumgrid.show import render
 
 IMAGES = Path(__file__).parents[1] / "docs" / "images"
 

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from illumgrid import show as preview
 from illumgrid.field.scene import Field, Material, Scene, box_around, level_table, upright
 from illumgrid.grid import GridSpec, IlluminationGrid, WallTexture
 from illumgrid.light import Illumination
-from illumgrid.show import render as preview
 from illumgrid.show.camera import fit_camera
 from illumgrid.show.viewer import page
 from illumgrid.show.viewer.packing import Stage

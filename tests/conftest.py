@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from illumgrid import cli
-from illumgrid.show import render as preview
+from illumgrid import show as preview
 from shapes import ball
 
 

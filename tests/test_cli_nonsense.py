@@ -12,8 +12,8 @@ import pytest
 import typer
 
 from illumgrid import cli, registry
+from illumgrid import show as preview
 from illumgrid.registry.options import options
-from illumgrid.show import render as preview
 from shapes import ball
 
 COMMANDS = typer.main.get_command(cli.app).commands

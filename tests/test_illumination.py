@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 import illumgrid as ig
-from illumgrid.show import render as preview
+from illumgrid import show as preview
 from illumgrid.tone import encode_srgb
 from shapes import ball, lit, refused, sky
 

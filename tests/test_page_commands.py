@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from browser import coloured, pair
-from illumgrid.show.render import render
+from illumgrid.show import render
 from illumgrid.tone import encode_srgb
 from shapes import lit, sky
 from test_cli_process import COMMAND

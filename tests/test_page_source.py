@@ -5,18 +5,21 @@ import re
 import threading
 import urllib.error
 import urllib.request
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-import illumgrid.show.viewer.packing as packing
 from browser import bent, coloured, pair
 from illumgrid.field.levelset import turned
-from illumgrid.field.volume import Volume, index_to_world
-from illumgrid.show.viewer import MODULES, SHADERS, compressed, page, script, source
-from illumgrid.show.viewer.packing import Stage, field_steps, packed, reduced
+from illumgrid.field.volume import Volume, box_corners, index_to_world
+from illumgrid.grid import GREY
+from illumgrid.show.trust import relative
+from illumgrid.show.viewer import MODULES, SHADERS, compressed, packing, page, script, source
+from illumgrid.show.viewer.arrays import field_steps, reduced, thinned
+from illumgrid.show.viewer.packing import Stage, packed
 from illumgrid.show.viewer.server import serve
-from shapes import MIRRORED, ball, sampled, sky
+from shapes import MIRRORED, ball, lit, sampled, sky
 
 LIGHT = coloured(pair())
 
@@ -79,11 +82,11 @@ def unpacked(scene, data, part):
 
 
 def halves(data, part):
-    count = int(np.prod(part["shape"]))
-    raw = np.frombuffer(data, np.uint8, 8 * count, part["offset"]).reshape(4, 2, count)
+    count, each = int(np.prod(part["shape"])), part["channels"] + 1
+    raw = np.frombuffer(data, np.uint8, 2 * each * count, part["offset"]).reshape(each, 2, count)
     words = raw[:, 0] + (raw[:, 1].astype(np.uint16) << 8)
-    words[1:3] += words[0]
-    return words.view(np.float16).reshape(4, *part["shape"][::-1]).transpose(3, 2, 1, 0)
+    words[1:-1] += words[0]
+    return words.view(np.float16).reshape(each, *part["shape"][::-1]).transpose(3, 2, 1, 0)
 
 
 @pytest.mark.plain
@@ -98,6 +101,8 @@ def test_fields_and_light_come_out_as_they_went_in():
         lit = grid.values * (LIGHT.exposure / np.pi)
         np.testing.assert_allclose(texels[..., :3], lit, rtol=5e-4)
         assert ((texels[..., 3] < 0) == (grid.support == 0)).all()
+        known = grid.support > 0
+        np.testing.assert_allclose(texels[known][:, 3], relative(grid, grid.bar)[known], rtol=2e-3, atol=1e-4)
     wall = scene["walls"][1]
     atlas = halves(data, scene["atlas"])[wall["offset"][0] :, : wall["texels"][1]]
     shown = LIGHT.walls[1].values.transpose(2, 1, 0, 3) * (LIGHT.exposure / np.pi)
@@ -156,6 +161,36 @@ def test_what_is_too_large_is_reduced_and_told(monkeypatch):
     assert scene["fields"][0]["values"]["shape"] == [10, 10, 10] and scene["fields"][0]["light"]["shape"] == [5, 5, 5]
     assert "20\u2009×\u200920\u2009×\u200920 to 10\u2009×\u200910\u2009×\u200910 voxels" in scene["notes"][0]
     assert "9\u2009×\u20099\u2009×\u20099 to 5\u2009×\u20095\u2009×\u20095 nodes" in scene["notes"][1]
+
+
+@pytest.mark.plain
+@pytest.mark.parametrize("nodes", [9, 10, 11, 12])
+def test_thinned_light_reaches_from_the_first_node_to_the_last_and_is_what_the_grid_answers(nodes):
+    grid = lit(sky(ball(20)), nodes=nodes).grids[0]
+    index = np.indices(grid.spec.shape).transpose(1, 2, 3, 0)
+    grid = replace(grid, values=1 + index / nodes, error=index[..., 0] / nodes)  # linear: fewer nodes answer the same
+    few = thinned(grid, most=6**3)
+    assert few is not grid and np.prod(few.spec.shape) <= 7**3
+    np.testing.assert_allclose(box_corners(few.spec), box_corners(grid.spec), atol=1e-12)
+    points = np.random.default_rng(0).uniform(-1, 1, (100, 3))
+    np.testing.assert_allclose(few.lookup(points), grid.lookup(points), atol=1e-5)
+    np.testing.assert_allclose(few.lookup(box_corners(grid.spec)), grid.lookup(box_corners(grid.spec)), atol=1e-5)
+    assert np.abs(few.error - np.linspace(0, 1 - 1 / nodes, len(few.error))[:, None, None]).max() <= 0.5 / nodes + 1e-6
+
+
+@pytest.mark.plain
+def test_grey_light_is_carried_in_one_channel():
+    scene, _ = packed(LIGHT)
+    assert [f["light"]["channels"] for f in scene["fields"]] == [3, 3] and scene["atlas"]["channels"] == 3
+    light = lit(sky(), value=0.7, nodes=5)
+    grid = light.grids[0]
+    light = replace(light, grids=(replace(grid, values=grid.values[..., :1], channels=GREY),))
+    grey, data = packed(light)
+    part = grey["fields"][0]["light"]
+    assert part["channels"] == 1
+    texels = halves(data, part)
+    assert texels.shape == (5, 5, 5, 2)
+    np.testing.assert_allclose(texels[..., 0], 1.0, rtol=1e-3)  # albedo 0.8 under the automatic exposure
 
 
 # The server

@@ -9,10 +9,11 @@ from functools import cache
 import numpy as np
 import pytest
 
+from illumgrid import show as preview
 from illumgrid.errors import BadInput
 from illumgrid.field.scene import Field, Material, Scene, box_around
-from illumgrid.show import render as preview
-from illumgrid.show.render import choose_engine, gl, grid_volume, render
+from illumgrid.show import choose_engine, grid_volume, render
+from illumgrid.show.engines import gl
 from illumgrid.show.shade import BACKGROUND
 from illumgrid.tone import encode_srgb
 from shapes import MIRRORED, OBLIQUE, ball, lit, refused, sampled, sky
@@ -93,13 +94,13 @@ def child(script, folder, **environment):
     here = os.path.dirname(__file__)
     return subprocess.run(
         [sys.executable, "-c", script], cwd=folder, capture_output=True, text=True, timeout=300,
-        env={**os.environ, "PYTHONPATH": here, **environment},
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([here, *sys.path]), **environment},
     )  # fmt: skip
 
 
 DRAW = """
 import sys, numpy as np
-from illumgrid.show.render import gl
+from illumgrid.show.engines import gl
 reason = gl.unavailable("{platform}")
 if reason:
     sys.exit("missing: " + reason)
@@ -164,7 +165,7 @@ ctypes.CDLL.__init__ = hidden
 """
 
 CHOOSE = """
-from illumgrid.show.render import choose_engine, render
+from illumgrid.show import choose_engine, render
 from test_preview_engines import lit, sky
 engine, why = choose_engine("auto")
 picture = render(lit(sky()), engine=engine, width=40, height=30)
@@ -220,7 +221,7 @@ def test_another_opengl_in_the_process_is_left_alone(monkeypatch):
     monkeypatch.setattr(gl, "_missing", {})
     monkeypatch.setattr(gl, "_opened", {"egl": None})
     assert "one OpenGL" in gl.unavailable("osmesa")
-    assert choose_engine("auto") == ("egl", "OpenGL answers by EGL")
+    assert choose_engine("auto") == ("egl", "OpenGL is available through EGL")
 
 
 def test_software_is_asked_for_without_a_look_at_opengl(monkeypatch):
@@ -231,7 +232,7 @@ def test_software_is_asked_for_without_a_look_at_opengl(monkeypatch):
 
 def test_only_one_file_imports_pyrender_and_only_when_it_draws():
     done = subprocess.run(
-        [sys.executable, "-c", "import sys, illumgrid.show.render, illumgrid.cli; print('pyrender' in sys.modules)"],
+        [sys.executable, "-c", "import sys, illumgrid.show, illumgrid.cli; print('pyrender' in sys.modules)"],
         capture_output=True, text=True,
     )  # fmt: skip
     assert done.stdout.strip() == "False"

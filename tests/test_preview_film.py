@@ -8,8 +8,9 @@ import pytest
 from PIL import Image
 
 import illumgrid as ig
-from illumgrid.show.render import fit_camera, render, widest_row
-from illumgrid.show.sweep import check_ending, film, frames, labelled
+from illumgrid.show import fit_camera, render, widest_row
+from illumgrid.show.captions import labelled
+from illumgrid.show.film import check_ending, film, frames
 from shapes import lit, refused, sky
 from test_tone_preview import three_balls
 
@@ -102,7 +103,7 @@ def test_the_isovalue_stands_in_the_corner_and_can_be_read(ground, tone):
 def test_the_isovalues_of_several_fields_are_written_with_their_names():
     drawn = list(frames(lit(three_balls()), "top", 2, lambda isovalue: np.full((60, 200, 3), isovalue * 10, np.uint8)))
     assert [d[0, 0, 0] for d in drawn] == [9, 11]
-    from illumgrid.show.sweep import isovalues_of
+    from illumgrid.show.captions import isovalues_of
 
     assert isovalues_of(three_balls(), np.array([0.9, 1.0, 1.123456])) == "x: 0.9,  front: 1,  top: 1.123"
 
@@ -151,7 +152,7 @@ def test_options_reach_the_picture(call, out):
 
 
 def test_a_sweep_that_fails_leaves_nothing(call, out, monkeypatch, tmp_path):
-    from illumgrid.show import render as preview
+    from illumgrid import show as preview
 
     def stop(*arguments, **options):
         raise KeyboardInterrupt

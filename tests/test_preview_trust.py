@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from illumgrid.show import trust
-from illumgrid.show.render import render
+from illumgrid.show import render, trust
 from illumgrid.show.trust import HIGH, LOW, SMALLEST, doubts, scale, scale_colors
 from illumgrid.tone import decode_srgb, encode_srgb
 from shapes import DIRECTIONS, ball, lit, refused, sky
@@ -110,7 +109,7 @@ def test_what_bars_cannot_tell_is_said_with_the_field():
     assert doubts(light) == []
     light = barred(0.05, nodes=12)
     light.grids[0].values[:] += np.random.default_rng(0).normal(size=(12, 12, 12, 1)).astype(np.float32)
-    assert doubts(light) == ["at least this far off: the grid does not resolve the light of field"]
+    assert doubts(light) == ["lower bounds only: the grid does not resolve the light of field"]
     light = barred(np.inf)
     assert len(doubts(light)) == 1 and "too few paths" in doubts(light)[0] and "field" in doubts(light)[0]
     light.grids[0].support[:] = 0  # a hole is no doubt: it is in the picture
@@ -147,7 +146,7 @@ def test_the_command_draws_it_says_its_doubts_and_goes_with_field_view_and_sweep
 
     call(*RUN, "--paths", 1)
     said = call("preview", "out", "--trust", *SMALL, "--view", "left", "--field", "v", "-o", "x.png")
-    assert "note: too few paths to tell the error of v" in said and "exposure" not in said
+    assert "note: too few paths to estimate the error of v" in said and "exposure" not in said
     with Image.open("x.png") as image:
         found = np.asarray(image)
     assert np.array_equal(found, render(ig.load("out"), trust=True, view="left", **SIZE))

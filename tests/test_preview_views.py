@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from illumgrid.field.scene import Field, Material, Scene
+from illumgrid.show import VIEWS, fit_camera, grid_volume, render, widest_row
 from illumgrid.show.block import FACES, HOLE
-from illumgrid.show.render import VIEWS, fit_camera, grid_volume, render, widest_row
 from illumgrid.tone import decode_srgb, encode_srgb
 from shapes import DIRECTIONS, ball, lit, refused, sky
 from test_tone_preview import GROUND, SIZE, is_object, places, three_balls

@@ -8,8 +8,8 @@ from PIL import Image
 
 from illumgrid.field.scene import Field, Material, Scene
 from illumgrid.field.volume import Volume
-from illumgrid.show.render import BACKGROUND, CAP_TONE, fit_camera, png, render
-from illumgrid.tone import WHITE, automatic_exposure, encode_srgb
+from illumgrid.show import BACKGROUND, CAP_TONE, fit_camera, png, render
+from illumgrid.tone import WHITE, automatic_exposure, curve, encode_srgb
 from shapes import lit, sampled, sky
 
 GROUND = encode_srgb(np.full(3, BACKGROUND))
@@ -40,15 +40,51 @@ def test_what_no_screen_can_show_is_clamped():
     assert encode_srgb(np.array([-1.0, 7.0, np.inf])).tolist() == [0, 255, 255]
 
 
-def test_exposure_brings_the_brightest_surfaces_to_white():
-    radiance = np.random.default_rng(0).random((10000, 3))
-    exposure = automatic_exposure(radiance)
-    assert np.quantile(radiance.max(axis=1) * exposure, 0.9) == pytest.approx(WHITE)
-    assert automatic_exposure(radiance * 1e-6) == pytest.approx(exposure * 1e6)
+def test_a_color_given_as_albedo_comes_out_as_that_color_under_the_median_light():
+    light = np.random.default_rng(0).random((10001, 3)).mean(axis=1, keepdims=True) * [1, 1, 1]
+    albedo = np.tile([0.4, 0.3, 0.1], (len(light), 1))
+    exposure = automatic_exposure(light, albedo)
+    middle = np.argsort(light[:, 0])[5000]
+    np.testing.assert_allclose(albedo[middle] / np.pi * light[middle] * exposure, albedo[middle], rtol=1e-6)
+    assert automatic_exposure(light * 1e-6, albedo) == pytest.approx(exposure * 1e6)
+
+
+def test_exposure_keeps_the_brightest_surfaces_below_the_shoulder():
+    light = np.random.default_rng(0).random((10000, 3))
+    exposure = automatic_exposure(light, np.full((10000, 3), 0.9))
+    assert np.quantile(light.max(axis=1) * 0.9 / np.pi * exposure, 0.9) == pytest.approx(WHITE)
 
 
 def test_exposure_of_the_dark_and_of_nothing_is_one():
-    assert automatic_exposure(np.zeros((5, 3))) == automatic_exposure(np.zeros((0, 3))) == 1.0
+    nothing = np.zeros((0, 3))
+    assert automatic_exposure(np.zeros((5, 3)), np.ones((5, 3))) == automatic_exposure(nothing, nothing) == 1.0
+    assert automatic_exposure(np.ones((5, 3)), np.zeros((5, 3))) == pytest.approx(np.pi)  # black paint: only the median
+
+
+def test_the_curve_keeps_shadows_and_middle_tones_and_rolls_highlights_off():
+    tones = np.linspace(0, 50, 100001)[:, None] * np.array([1.0, 0.7, 0.2])
+    shown = curve(tones)
+    below = tones.max(axis=1) <= WHITE
+    assert np.array_equal(shown[below], tones[below])
+    peak = shown.max(axis=1)
+    assert (np.diff(peak) > 0).all() and peak[-1] < 1
+    slope = np.diff(peak) / np.diff(tones[:, 0])
+    assert np.abs(np.diff(slope)).max() < 0.02  # no kink at the shoulder, where the slope is 1
+    one = curve(np.array([[WHITE + 0.05, 0, 0], [1e9, 0, 0], [np.inf, np.inf, 0], [-1, 0.5, 0]]))
+    assert np.isfinite(one).all() and one.max() <= 1 and one[3].tolist() == [0, 0.5, 0]
+
+
+def test_highlights_keep_their_hue_and_only_the_very_bright_fade_to_white():
+    from colorsys import rgb_to_hsv
+
+    color = np.array([0.8, 0.4, 0.1])
+    hue, saturation, _ = rgb_to_hsv(*color)
+    for gain, least in ((1.5, 0.95), (3.0, 0.75)):
+        shown = rgb_to_hsv(*curve(gain * color[None])[0])
+        assert shown[0] == pytest.approx(hue) and least * saturation < shown[1] < saturation
+        clamped = rgb_to_hsv(*np.minimum(gain * color, 1))
+        assert abs(clamped[0] - hue) > 0.01  # which is what the curve is for
+    assert rgb_to_hsv(*curve(1e4 * color[None])[0])[1] < 0.01
 
 
 # Which way is up, and which is right

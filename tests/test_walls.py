@@ -15,7 +15,7 @@ from illumgrid.grid import GridSpec, WallTexture
 from illumgrid.interpolators.nearest import Nearest
 from illumgrid.io import store
 from illumgrid.samplers.direct import Direct
-from illumgrid.show.render import fit_camera, render
+from illumgrid.show import fit_camera, render
 from shapes import ball, lit
 from test_store import assert_same, example
 from transport import waves

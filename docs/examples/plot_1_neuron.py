@@ -14,7 +14,7 @@ import numpy as np
 from gallery_fields import neuron
 
 import illumgrid as ig
-from illumgrid.show.render import render
+from illumgrid.show import render
 
 volume, limits, source = neuron()
 

@@ -11,7 +11,7 @@ import numpy as np
 from gallery_fields import brain
 
 import illumgrid as ig
-from illumgrid.show.render import render
+from illumgrid.show import render
 
 volume, limits, source = brain()
 light = ig.run(ig.Scene.sky(volume, albedo=(0.8, 0.66, 0.6), range=limits), paths=24)

@@ -18,7 +18,7 @@ import numpy as np
 
 import illumgrid as ig
 from illumgrid.field.builtin import spread
-from illumgrid.show.render import render
+from illumgrid.show import render
 
 random = np.random.default_rng(4)
 volume = spread(random.uniform(-0.55, 0.55, (14, 3)), voxels=48, sigma=0.17)

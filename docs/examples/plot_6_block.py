@@ -13,7 +13,7 @@ import numpy as np
 
 import illumgrid as ig
 from illumgrid.field.builtin import spread
-from illumgrid.show.render import grid_volume, render
+from illumgrid.show import grid_volume, render
 
 density = spread(np.random.default_rng(4).uniform(-0.5, 0.5, (14, 3)), voxels=48, sigma=0.2)
 volume = density.with_values(density.values**0.2)  # spreads the isosurfaces evenly over the volume

@@ -14,7 +14,7 @@ import matplotlib.pyplot as plt
 
 import illumgrid as ig
 from illumgrid.field.builtin import nucleus
-from illumgrid.show.render import fit_camera, render, widest_row
+from illumgrid.show import fit_camera, render, widest_row
 
 scene = nucleus()
 light = ig.run(scene, grid=28, paths=48, isovalues=5)

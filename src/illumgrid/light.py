@@ -46,11 +46,9 @@ class Illumination:
     @cached_property
     def exposure(self) -> float:
         """Automatic exposure: one for all isovalues, views and fields, from the light that the grids hold."""
-        shown = [
-            grid.values[grid.support > 0] * (field.material.albedo / np.pi).astype(np.float32)
-            for field, grid in zip(self.scene.fields, self.grids)
-        ]
-        return tone.automatic_exposure(np.concatenate(shown))
+        lit = [grid.values[grid.support > 0] for grid in self.grids]
+        albedo = [np.broadcast_to(f.material.albedo, e.shape) for f, e in zip(self.scene.fields, lit)]
+        return tone.automatic_exposure(np.concatenate(lit), np.concatenate(albedo))
 
     @cached_property
     def marchable(self) -> Marchable:
@@ -71,11 +69,11 @@ class Illumination:
         Returns
         -------
         (n, 3) uint8
-            sRGB of albedo/π · E · exposure.
+            sRGB of the tone curve of albedo/π · E · exposure.
         """
         number = self.scene.number_of(field)
         radiance = self.grids[number].lookup(points) * self.scene.fields[number].material.albedo / np.pi
-        return tone.encode_srgb(radiance * (self.exposure if exposure is None else exposure))
+        return tone.encode_srgb(tone.curve(radiance * (self.exposure if exposure is None else exposure)))
 
     def show(self, isovalue: float | None = None, height: int = 520) -> Any:
         """View in a notebook: the interactive page, with its isovalue as a synced trait.
@@ -103,9 +101,9 @@ class Illumination:
 
     def _repr_png_(self) -> bytes:
         """Still picture, as a notebook shows it."""
-        from illumgrid.show import render
+        from illumgrid.show import png, render
 
-        return render.png(render.render(self, width=640, height=480))
+        return png(render(self, width=640, height=480))
 
     def save(self, folder: str | os.PathLike[str], *, preview: bool = True, overwrite: bool = False) -> None:
         """Write a folder that holds everything: see `illumgrid.load`.
@@ -116,9 +114,9 @@ class Illumination:
             If the folder holds a finished run and not `overwrite`, or anything that is not ours.
         """
         from illumgrid.io import store
-        from illumgrid.show import render
+        from illumgrid.show import png, render
 
         store.claim(folder, overwrite)
-        picture = render.png(render.render(self)) if preview else None
+        picture = png(render(self)) if preview else None
         recipe = {**self.recipe, "exposure": self.exposure}
         store.write(folder, store.Stored(self.scene, self.levels, self.grids, self.walls, recipe), picture, overwrite)

@@ -1,21 +1,47 @@
-"""From linear light to what a screen shows: the only place where light is clamped."""
+"""From linear light to what a screen shows: exposure, tone curve, sRGB; the only place where light is clamped."""
 
 import numpy as np
 from numpy.typing import NDArray
 
 WHITE = 0.8
-"""Display radiance that automatic exposure gives to the brightest surfaces; sRGB 0.91, short of clipping."""
+"""Display radiance up to which the tone curve changes nothing; sRGB 231 of 255."""
 
 
-def automatic_exposure(radiance: NDArray[np.floating]) -> float:
-    """Factor that brings the 90th percentile of the brightest channel of (n, 3) radiances to `WHITE`; 1 if all is dark.
+def automatic_exposure(irradiance: NDArray[np.floating], albedo: NDArray[np.floating]) -> float:
+    """Factor on albedo/π · irradiance, (n, 3) each, under which a picture is neither dark nor burnt out.
 
-    The brightest channel, not the luminance: a saturated surface keeps its hue.
+    Under the median light a colour given as albedo comes out as that colour, unless the 90th percentile of the
+    brightest channel would then exceed `WHITE`, where highlights begin to lose contrast. 1 if all is dark.
     """
-    if not len(radiance):
+    if not len(irradiance):
         return 1.0
-    bright = float(np.quantile(radiance.max(axis=1), 0.9))
-    return WHITE / bright if bright > 0 and np.isfinite(bright) else 1.0
+    median = float(np.median(irradiance.mean(axis=1))) / np.pi
+    bright = float(np.quantile((irradiance * albedo).max(axis=1), 0.9)) / np.pi
+    factors = [target / value for target, value in ((1.0, median), (WHITE, bright)) if 0 < value < np.inf]
+    return min(factors, default=1.0)
+
+
+def curve(linear: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Display values (..., 3), below 1, of exposed radiance (..., 3): highlights roll off and keep their hue.
+
+    The curve of Khronos PBR Neutral [1]_ without its offset, which corrects for a specular layer that a diffuse surface
+    does not have: values up to `WHITE` stay as they are, and shadows with them. Above, the brightest channel approaches
+    1 as 1 - d²/(peak + 2d - 1), d = 1 - `WHITE`, the others keep their ratio to it, and the very bright fades to white.
+
+    References
+    ----------
+    .. [1] Khronos Group, "Khronos PBR Neutral Tone Mapper", specification of 2024.
+    """
+    light = np.maximum(linear, 0.0)
+    peak = light.max(axis=-1, keepdims=True)
+    if not (peak > WHITE).any():
+        return np.asarray(light)
+    room = 1.0 - WHITE
+    excess = np.minimum(np.maximum(peak - WHITE, 0.0), 1e30)
+    rolled = 1.0 - room * room / (excess + room)
+    faded = 1.0 - 1.0 / (0.15 * np.maximum(peak - rolled, 0.0) + 1.0)
+    share = np.divide(light, peak, out=np.ones_like(light), where=np.isfinite(peak) & (peak > 0))
+    return np.asarray(np.where(peak > WHITE, rolled * (share + (1.0 - share) * faded), light), dtype=linear.dtype)
 
 
 def srgb_curve(linear: NDArray[np.floating]) -> NDArray[np.floating]:
@@ -27,6 +53,13 @@ def srgb_curve(linear: NDArray[np.floating]) -> NDArray[np.floating]:
 def encode_srgb(linear: NDArray[np.floating]) -> NDArray[np.uint8]:
     """Eight-bit sRGB of linear display values, clamped to 0 .. 1."""
     return np.asarray(np.round(255.0 * srgb_curve(linear)), dtype=np.uint8)
+
+
+def encode_rgba(linear: NDArray[np.floating]) -> NDArray[np.uint8]:
+    """Eight-bit sRGB with coverage (..., 4) of linear display values (..., 4) that are multiplied by their coverage."""
+    coverage = linear[..., 3:]
+    color = np.divide(linear[..., :3], coverage, out=np.zeros_like(linear[..., :3]), where=coverage > 0)
+    return np.concatenate([encode_srgb(color), np.round(255.0 * coverage).astype(np.uint8)], axis=-1)
 
 
 _byte = np.arange(256) / 255

@@ -56,9 +56,9 @@ def preview(
     engine: Annotated[str, typer.Option(help="What draws: auto, egl, osmesa, software.")] = "auto",
 ) -> None:
     """Draw one isosurface of a finished run, or a sweep through many."""
+    from illumgrid import show as pictures
     from illumgrid.chain import load
     from illumgrid.io import store
-    from illumgrid.show import render as pictures
 
     _check(output, sweep, isovalue, local, trust, split, grid_volume, cut)
     drawn_by, why = pictures.choose_engine(engine)
@@ -117,7 +117,7 @@ def _check(
             raise BadInput("--isovalue came with --sweep, which shows the whole range; leave one of the two out")
         if not 2 <= sweep[0] <= 10000:
             raise BadInput(f"--sweep got {sweep[0]} isovalues; expected 2 to 10000")
-        from illumgrid.show.sweep import check_ending
+        from illumgrid.show.film import check_ending
 
         check_ending(sweep[1].name, sweep[1].suffix.lower())
         if sweep[1].suffix and sweep[1].is_dir():
@@ -138,7 +138,7 @@ def _drawn(
     """What draws an isovalue: one picture, or two side by side."""
     import numpy as np
 
-    from illumgrid.show.render import render
+    from illumgrid.show import render
 
     def draw(isovalue: float | None) -> Any:
         lights = (True, False) if split else (local,)
@@ -151,8 +151,8 @@ def _sweep(
     light: "Illumination", field: str | None, sweep: tuple[int, Path], local: bool, split: bool, options: dict[str, Any]
 ) -> None:
     from illumgrid.io import store
-    from illumgrid.show.render import fit_camera, png, render, widest_row
-    from illumgrid.show.sweep import film, frames
+    from illumgrid.show import fit_camera, png, render, widest_row
+    from illumgrid.show.film import film, frames
 
     count, path = sweep
     width, height = (options.get(side, (render.__kwdefaults__ or {})[side]) for side in ("width", "height"))

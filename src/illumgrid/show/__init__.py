@@ -1,1 +1,30 @@
-"""Pictures: still, swept, and on a page."""
+"""Pictures of an `illumgrid.Illumination`: a still picture, a strip, a film, and the interactive page."""
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from illumgrid.show.camera import UPS, VIEWS, Camera, fit_camera, widest_row
+    from illumgrid.show.engines import ENGINES, choose_engine
+    from illumgrid.show.picture import grid_volume, png, render, strip
+    from illumgrid.show.shade import BACKGROUND, CAP_TONE
+
+__all__ = [
+    "BACKGROUND", "CAP_TONE", "ENGINES", "UPS", "VIEWS", "Camera", "choose_engine", "fit_camera", "grid_volume", "png",
+    "render", "strip", "widest_row",
+]  # fmt: skip
+
+_HOMES = {
+    "camera": ("UPS", "VIEWS", "Camera", "fit_camera", "widest_row"),
+    "engines": ("ENGINES", "choose_engine"),
+    "picture": ("grid_volume", "png", "render", "strip"),
+    "shade": ("BACKGROUND", "CAP_TONE"),
+}
+_HOME = {name: home for home, names in _HOMES.items() for name in names}
+
+
+def __getattr__(name: str) -> Any:
+    """Import a name where it is first used: the engines and Pillow are heavy."""
+    if name not in _HOME:
+        raise AttributeError(f"module 'illumgrid.show' has no attribute {name!r}")
+    return getattr(importlib.import_module(f"illumgrid.show.{_HOME[name]}"), name)

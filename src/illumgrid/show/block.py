@@ -1,4 +1,4 @@
-"""The illumination grid itself as a block of light, whole or with the corner towards the eye cut out (Figure 6)."""
+"""The illumination grid as a block of light, whole or with the corner towards the eye cut out (Figure 6)."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -6,18 +6,17 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from illumgrid.field.scene import upright
 from illumgrid.field.volume import Floats, index_to_world
 from illumgrid.grid import GridSpec, read_lattice
-from illumgrid.show import software
-from illumgrid.show.camera import Camera
-from illumgrid.show.meshes import Colored, squares
-from illumgrid.show.shade import Colors, Shown
+from illumgrid.show.camera import Camera, axes_of
+from illumgrid.show.engines import software
+from illumgrid.show.shade import Colors, Shown, opaque
+from illumgrid.show.triangles import Colored, squares
 
-NEAR = 1e-9  # index units: a ray that comes this close to the corner that was cut out is in it
-FACES = 0.8, 0.9, 1.0  # tones of faces across, along and above the view from the front: unlit, they would run together
-STEPS = 256  # squares along a side, at least about: what is bilinear between nodes is then linear to the eye
-HOLE = 0.3  # tone of a place between holes only: no level set within the range goes there
+NEAR = 1e-9  # index units: a ray this close to the octant that was cut out enters it
+FACES = 0.8, 0.9, 1.0  # tones of faces across, along and above the view from the front, so that edges show
+STEPS = 256  # squares along a side, at least about: between nodes light is bilinear, in triangles linear
+HOLE = 0.3  # tone between holes only: no level set within the range passes there
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,14 +58,14 @@ class Block:
         """Lowest and highest index (3,) of the corner that is cut out; its inner faces lie on nodes."""
         middle = np.floor(self.last / 2 + 0.5)
         # Seen along an axis no corner is nearest: the right, upper, front one, by a nudge too small to decide else.
-        nudge = self.spec.direction.T @ sum(upright(self.spec.direction))
+        nudge = self.spec.direction.T @ sum(axes_of(self.spec.direction))
         upper = self.index(self.eye) - self.last / 2 + 1e-6 * self.last * nudge > 0
         return np.where(upper, middle, 0.0), np.where(upper, self.last, middle)
 
     @cached_property
     def tones(self) -> Floats:
         """Tone (3,) of the faces across each axis."""
-        across = np.abs(self.spec.direction.T @ np.stack(upright(self.spec.direction), axis=1))
+        across = np.abs(self.spec.direction.T @ np.stack(axes_of(self.spec.direction), axis=1))
         return np.asarray(across @ [FACES[0], FACES[1], FACES[2]])
 
     def color(self, points: Floats, axis: NDArray[np.integer]) -> Colors:
@@ -76,8 +75,8 @@ class Block:
         tone = (HOLE + (1 - HOLE) * known) * self.tones[axis][:, None]
         return np.asarray(tone * self.shown.field(self.number, points, np.zeros(len(points))), dtype=np.float32)
 
-    def draw(self, camera: Camera, width: int, height: int, background: Colors) -> Colors:
-        """Display-linear picture (height, width, 3)."""
+    def draw(self, camera: Camera, width: int, height: int, background: Colors) -> NDArray[np.uint8]:
+        """Picture (height, width, 4), sRGB and coverage."""
         start = self.index(camera.eye)
 
         def seen(directions: Floats) -> Colors:
@@ -92,31 +91,38 @@ class Block:
                 t, axis = np.where(open_, inner, t), np.where(open_, inner_axis, axis)
                 hit &= t < far * (1 - NEAR)
             color = np.tile(background, (len(directions), 1))
-            color[hit] = self.color(camera.eye + t[hit, None] * directions[hit], axis[hit])
+            color[hit] = opaque(self.color(camera.eye + t[hit, None] * directions[hit], axis[hit]))
             return color
 
         return software.traced(seen, camera, width, height)
 
     def sheets(self) -> list[Colored]:
-        """Draw the faces as triangles between the nodes."""
+        """The faces as triangles between the nodes, with the middle planes where the octant is cut out."""
         low, high = self.octant
-        steps = max(1, STEPS // max(self.spec.shape))
         found = []
         for axis in range(3):
-            u, v = (k for k in range(3) if k != axis)
             inner, outer = (low, high) if low[axis] > 0 else (high, low)
-            for plane in {0.0, self.last[axis], inner[axis]} if self.cut else {0.0, self.last[axis]}:
-                nu, nv = (steps * int(self.last[k]) + 1 for k in (u, v))
-                i, j = (x.ravel() / steps for x in np.indices((nu, nv)))
-                index = np.insert(np.stack([i, j], axis=1), axis, plane, axis=1)
-                faces = squares(nu, nv)
-                middle = index[faces].mean(axis=1)[:, [u, v]]
-                gone = self.cut & ((middle > low[[u, v]]) & (middle < high[[u, v]])).all(axis=1)
-                if plane in (inner[axis], outer[axis]):
-                    faces = faces[gone if self.cut and plane == inner[axis] else ~gone]
-                points = index_to_world(self.spec, index)
-                found.append(Colored(points, faces, self.color(points, np.full(len(points), axis))))
+            found.append(self._sheet(axis, self.last[axis] - outer[axis], cut=False, inside=False))
+            found.append(self._sheet(axis, outer[axis], cut=self.cut, inside=False))
+            if self.cut:
+                found.append(self._sheet(axis, inner[axis], cut=True, inside=True))
         return found
+
+    def _sheet(self, axis: int, plane: float, cut: bool, inside: bool) -> Colored:
+        """The plane of this index across an axis; if `cut`, its part `inside` the octant or the rest of it."""
+        low, high = self.octant
+        steps = max(1, STEPS // max(self.spec.shape))
+        u, v = (k for k in range(3) if k != axis)
+        nu, nv = (steps * int(self.last[k]) + 1 for k in (u, v))
+        i, j = (x.ravel() / steps for x in np.indices((nu, nv)))
+        index = np.insert(np.stack([i, j], axis=1), axis, plane, axis=1)
+        faces = squares(nu, nv)
+        if cut:
+            middle = index[faces].mean(axis=1)[:, [u, v]]
+            within = ((middle > low[[u, v]]) & (middle < high[[u, v]])).all(axis=1)
+            faces = faces[within == inside]
+        points = index_to_world(self.spec, index)
+        return Colored(points, faces, self.color(points, np.full(len(points), axis)))
 
 
 def _through(

@@ -1,5 +1,6 @@
-"""Where a picture is seen from."""
+"""The camera: which way is up, where the eye is, and what the picture holds."""
 
+import json
 import math
 from dataclasses import dataclass
 
@@ -8,7 +9,7 @@ from numpy.typing import NDArray
 
 from illumgrid.errors import BadInput
 from illumgrid.field.levelset import turned, upward
-from illumgrid.field.scene import Scene, upright
+from illumgrid.field.scene import Scene
 from illumgrid.field.volume import Floats, box_corners, index_to_world
 
 HALF_ANGLE = 0.27  # tangent of half the vertical angle of view, 30 degrees in all
@@ -18,6 +19,11 @@ VIEWS = {
     "top": (0.0, 90.0), "bottom": (0.0, -90.0), "iso": (45.0, math.degrees(math.asin(1 / math.sqrt(3)))),
 }  # fmt: skip
 """Azimuth and elevation in degrees: from the front to the right, and upwards."""
+
+UPS = {
+    f"{sign}{name}": factor * axis for sign, factor in (("", 1.0), ("-", -1.0)) for name, axis in zip("xyz", np.eye(3))
+}
+"""World directions (3,) that can be up."""
 
 View = str | tuple[float, float] | None
 
@@ -40,6 +46,70 @@ class Camera:
     up: Floats
     forward: Floats
     tangent: float
+
+
+def camera_text(camera: Camera) -> str:
+    """A camera as JSON."""
+    parts = {name: getattr(camera, name).tolist() for name in ("eye", "right", "up", "forward")}
+    return json.dumps({**parts, "tangent": camera.tangent})
+
+
+def camera_of(text: str) -> Camera:
+    """The camera that `camera_text` wrote."""
+    try:
+        parts = json.loads(text)
+        vectors = [np.array(parts[name], dtype=float) for name in ("eye", "right", "up", "forward")]
+        tangent = float(parts["tangent"])
+        fits = all(v.shape == (3,) and np.isfinite(v).all() for v in vectors) and 0 < tangent < math.inf
+    except (ValueError, TypeError, KeyError):
+        fits = False
+    if not fits:
+        raise BadInput(
+            f"the camera is {text[:60]!r}; expected eye, right, up, forward and tangent as preview writes them"
+        )
+    eye, right, up, forward = vectors
+    return Camera(eye, right, up, forward, tangent)
+
+
+def axes_of(direction: Floats, up: str = "z") -> tuple[Floats, Floats, Floats]:
+    """World directions (3,) right, front, up along the axes of an array with this `direction`.
+
+    Up is the array axis nearest to the world direction `up`. The front is the one nearest to -y (the face, in medical
+    coordinates); where y is vertical, the one from which +x points to the right.
+    """
+    if up not in UPS:
+        raise BadInput(f"up is {up!r}; expected one of {', '.join(UPS)}")
+    wanted = UPS[up]
+    facing = np.cross(UPS["x"], wanted) if up.endswith("y") else UPS["-y"]
+    heights = direction.T @ wanted
+    vertical = int(np.argmax(np.abs(heights)))
+    depths = np.where(np.arange(3) == vertical, 0.0, direction.T @ facing)
+    level = int(np.argmax(np.abs(depths)))
+    upward_axis = direction[:, vertical] * np.sign(heights[vertical])
+    front = direction[:, level] * (np.sign(depths[level]) or 1.0)
+    return np.cross(upward_axis, front), front, upward_axis
+
+
+FLAT, ROUND = 0.2, 0.05  # area of an end over the largest section: a flat cut, a rounded end
+
+
+def up_of(scene: Scene) -> str:
+    """The default up: world +z, or -z for an object that would stand on its head.
+
+    Only an array without orientation (identity axes at the origin: its file states none) in a scene without walls is
+    turned over, and only if the solid ends in a flat cut on top and is rounded below: a bust stands on its neck.
+    """
+    volume = scene.fields[0].volume
+    stated = (volume.direction != np.eye(3)).any() or volume.origin.any()
+    if stated or scene.quads or len(scene.fields) > 1:
+        return "z"
+    solid = scene.fields[0].solid(volume.values, widest_row(scene)[0])
+    areas = solid.sum(axis=(0, 1))
+    filled = areas[areas > 0]
+    if len(filled) < 2:
+        return "z"
+    below, above = filled[[0, -1]] / filled.max()
+    return "-z" if above > FLAT and below < ROUND else "z"
 
 
 def angles(view: str | tuple[float, float]) -> tuple[float, float]:
@@ -100,15 +170,22 @@ def widest_row(scene: Scene) -> Floats:
 ZOOM = 1e6  # the largest: beyond it, and below its inverse, nothing is seen, and tangents overflow
 
 
-def fit_camera(scene: Scene, row: Floats, aspect: float, view: View = None, zoom: float = 1.0) -> Camera:
-    """Camera that looks at the solids under one row of levels and just holds them.
-
-    Up is the array axis nearest to world +z, the front the one nearest to -y (the face, in medical coordinates).
+def fit_camera(
+    scene: Scene,
+    row: Floats,
+    aspect: float,
+    view: View = None,
+    zoom: float = 1.0,
+    *,
+    up: str | None = None,
+    roll: float = 0.0,
+) -> Camera:
+    """Camera that looks at the solids under one row of levels, or several, and just holds them.
 
     Parameters
     ----------
     scene : Scene
-    row : (F,) float64
+    row : (F,) or (n, F) float64
         Isovalue of every field.
     aspect : float
         Width of the picture over its height.
@@ -117,24 +194,40 @@ def fit_camera(scene: Scene, row: Floats, aspect: float, view: View = None, zoom
         into a closed scene one looks straight.
     zoom : float
         Enlarges the middle of the picture.
+    up : {"x", "y", "z", "-x", "-y", "-z"}, optional
+        World direction that is up, by the array axis nearest to it; by default as `up_of` says.
+    roll : float
+        Degrees by which the picture is turned clockwise.
     """
-    outline = outline_of(scene, row)
+    outline = np.concatenate([outline_of(scene, one) for one in np.atleast_2d(row)])
+    axes = axes_of(scene.fields[0].volume.direction, up or up_of(scene))
     if view is None:
-        extent = np.ptp(outline @ np.stack(upright(scene.fields[0].volume.direction), axis=1), axis=0)
+        extent = np.ptp(outline @ np.stack(axes, axis=1), axis=0)
         flat, closed = extent[2] < 0.5 * extent[:2].min(), not scene.background.any()
         view = 0.0 if closed else 30.0, 60.0 if flat else 6.0 if closed else 18.0
-    return camera_around(outline, scene.fields[0].volume.direction, aspect, view, zoom)
+    return camera_around(outline, axes, aspect, view, zoom, roll)
 
 
-def camera_around(outline: Floats, direction: Floats, aspect: float, view: View, zoom: float = 1.0) -> Camera:
-    """Camera that just holds world points (m, 3), seen from `view` in the axes of an array with this `direction`."""
+def camera_around(
+    outline: Floats,
+    axes: tuple[Floats, Floats, Floats],
+    aspect: float,
+    view: View,
+    zoom: float = 1.0,
+    roll: float = 0.0,
+) -> Camera:
+    """Camera that just holds world points (m, 3), seen from `view` among these `axes` (right, front, up)."""
     if not 1 / ZOOM <= zoom <= ZOOM:
         raise BadInput(f"the zoom is {zoom}; expected a positive number up to {ZOOM:g}: 2 shows all twice as large")
+    if not math.isfinite(roll):
+        raise BadInput(f"the roll is {roll}; expected degrees")
     azimuth, elevation = np.radians(angles("front" if view is None else view))
-    side, front, up = upright(direction)
-    forward = -np.cos(elevation) * (np.cos(azimuth) * front + np.sin(azimuth) * side) - np.sin(elevation) * up
-    right = np.cos(azimuth) * side - np.sin(azimuth) * front
-    up = np.cross(right, forward)
+    side, front, upward_axis = axes
+    forward = -np.cos(elevation) * (np.cos(azimuth) * front + np.sin(azimuth) * side) - np.sin(elevation) * upward_axis
+    level = np.cos(azimuth) * side - np.sin(azimuth) * front
+    above = np.cross(level, forward)
+    turn = np.radians(roll)
+    right, up = np.cos(turn) * level + np.sin(turn) * above, np.cos(turn) * above - np.sin(turn) * level
     return Camera(_eye(outline, right, up, forward, aspect), right, up, forward, HALF_ANGLE / zoom)
 
 

@@ -2,23 +2,27 @@
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from illumgrid.field.scene import Scene
 from illumgrid.field.volume import Floats
+from illumgrid.light import Illumination
 from illumgrid.show.trust import trust_colors
-from illumgrid.tone import WHITE
-
-if TYPE_CHECKING:
-    from illumgrid.light import Illumination
+from illumgrid.tone import WHITE, curve
 
 BACKGROUND = 0.045  # display-linear: a dark neutral, against which white surfaces and their shadows both stand out
-CAP_TONE = 0.22  # display radiance of a cap, for albedo 1: caps are cuts, not lit surfaces
+CAP_TONE = (
+    0.45  # display radiance of a cap, for albedo 1: a cut carries no light, and a dark tone would look like a hole
+)
 
 Colors = NDArray[np.float32]
+
+
+def opaque(color: Colors) -> Colors:
+    """Colours (..., 4) of full coverage."""
+    return np.concatenate([color, np.ones((*color.shape[:-1], 1), np.float32)], axis=-1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,23 +35,31 @@ class Shown:
     row : (F,) float64
         Isovalue of every field.
     share : float
-        The place in the common sweep, 0 to 1, as the walls know it.
+        The place in the common sweep, 0 to 1, at which wall textures are read.
     local : bool
-        Light by a lamp at the camera only.
+        A lamp at the camera in place of the stored light, without shadows.
     trust : bool
-        In place of light, how sure it is: see `illumgrid.show.trust`.
+        In place of light, its relative error bar: see `illumgrid.show.trust`.
+    stops : float
+        Exposure beyond the automatic one, in EV: each doubles the light.
     """
 
-    light: "Illumination"
+    light: Illumination
     row: Floats
     share: float
-    local: bool
+    local: bool = False
     trust: bool = False
+    stops: float = 0.0
 
     @cached_property
     def scene(self) -> Scene:
         """Scene that is lit."""
         return self.light.scene
+
+    @cached_property
+    def exposure(self) -> float:
+        """Factor on albedo/π · E."""
+        return self.light.exposure * float(2.0**self.stops)
 
     def field(self, number: int, points: Floats, facing: Floats) -> Colors:
         """Colours (n, 3) of the level set of a field at world points (n, 3) that face the eye by this cosine (n,)."""
@@ -55,25 +67,27 @@ class Shown:
             return trust_colors(self.light.grids[number], points, facing)
         albedo = self.scene.fields[number].material.albedo
         if self.local:
-            return np.float32(WHITE) * _headlit(albedo / albedo.max(initial=1e-9), facing)
-        return self.light.grids[number].lookup(points) * (albedo / np.pi * self.light.exposure).astype(np.float32)
+            return self._lamplit(albedo / albedo.max(initial=1e-9), facing)
+        return curve(self.light.grids[number].lookup(points) * (albedo / np.pi * self.exposure).astype(np.float32))
 
     def cap(self, number: int) -> Colors:
         """Colour (3,) of the cuts through the solid of a field."""
-        if self.trust:
-            return np.full(3, CAP_TONE, np.float32)
-        return (CAP_TONE * self.scene.fields[number].material.albedo).astype(np.float32)
+        albedo = np.full(3, 0.5) if self.trust else self.scene.fields[number].material.albedo
+        return (CAP_TONE * albedo).astype(np.float32)
 
     def wall(self, number: int, u: Floats, v: Floats, facing: Floats) -> Colors:
         """Colours (n, 3) of the front of a quad at shares u, v (n,) of its edges."""
         material = self.scene.quads[number].material
-        if self.trust:  # no bar is known there: no colour that could be taken for one
-            return _headlit(np.full(3, CAP_TONE), facing)
+        if self.trust:  # walls have no error bar: no colour that could be taken for one
+            return _facing(np.full(3, 0.5 * CAP_TONE), facing)
         if self.local:
-            return np.float32(WHITE) * _headlit(np.maximum(material.albedo, material.emission.clip(0, 1)), facing)
+            return self._lamplit(np.maximum(material.albedo, material.emission.clip(0, 1)), facing)
         shown = material.albedo / np.pi * self.light.walls[number].lookup(u, v, self.share) + material.emission
-        return (shown * self.light.exposure).astype(np.float32)
+        return curve((shown * self.exposure).astype(np.float32))
+
+    def _lamplit(self, color: Floats, facing: Floats) -> Colors:
+        return curve(np.float32(2.0**self.stops * WHITE) * _facing(color, facing))
 
 
-def _headlit(color: Floats, facing: Floats) -> Colors:
+def _facing(color: Floats, facing: Floats) -> Colors:
     return (color * np.maximum(facing, 0.0)[:, None]).astype(np.float32)

@@ -7,14 +7,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from illumgrid import show as preview
 from illumgrid import tone
 from illumgrid.accuracy.truth import Truth, apart
 from illumgrid.field.scene import Scene, level_table
 from illumgrid.field.volume import Floats
 from illumgrid.grid import IlluminationGrid, WallTexture
 from illumgrid.light import Illumination
-from illumgrid.show import render as preview
-from illumgrid.show.software import SIDE
+from illumgrid.show.engines.software import SIDE
 from illumgrid.stages import Backend
 from illumgrid.transport.samples import Queries
 
@@ -76,7 +76,7 @@ class Studio:
         if height < 48 or importlib.util.find_spec("flip_evaluator") is None:
             return None
         albedo = np.array([field.material.albedo for field in scene.fields])[truth.queries.target]
-        exposure = tone.automatic_exposure((truth.light * albedo / np.pi).astype(np.float32))
+        exposure = tone.automatic_exposure(truth.light, albedo)
         row = scene.levels(SHARE)[0]
         grids = [Traced(scene, backend, n, row, truth.bounces, seed) for n in range(len(scene.fields))]
         width = height * 4 // 3

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from illumgrid.field.volume import Floats, Lattice, index_to_world, interpolate, world_to_index
-from illumgrid.tone import encode_srgb
+from illumgrid.tone import curve, encode_srgb
 
 if TYPE_CHECKING:
     from illumgrid.bake import Progress
@@ -37,7 +37,7 @@ class Points:
     albedo : (3,) float64
         Of the field's material.
     exposure : float
-        What `color` was exposed by: sRGB of albedo/π · irradiance · exposure.
+        What `color` was exposed by: sRGB of the tone curve of albedo/π · irradiance · exposure.
     """
 
     field: str
@@ -48,9 +48,9 @@ class Points:
 
 
 def display_linear(light: "Illumination", number: int, irradiance: NDArray[np.float32]) -> NDArray[np.float32]:
-    """What a screen shows of irradiance (n, 3), before sRGB: albedo/π · E · exposure, not clamped."""
+    """What a screen shows of irradiance (n, 3), before sRGB: the tone curve of albedo/π · E · exposure."""
     factor = light.scene.fields[number].material.albedo / np.pi * light.exposure
-    return np.asarray(irradiance * factor, dtype=np.float32)
+    return np.asarray(curve(irradiance * factor), dtype=np.float32)
 
 
 def points_of(light: "Illumination", number: int, on: str, names: Sequence[str], progress: "Progress") -> Points:

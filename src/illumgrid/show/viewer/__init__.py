@@ -10,12 +10,11 @@ import json
 import re
 from functools import cache
 from importlib.resources import files
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-if TYPE_CHECKING:
-    from illumgrid.light import Illumination
+from illumgrid.light import Illumination
 
-MODULES = ("numbers", "camera", "state", "sweeps", "hands", "picture", "view")  # each imports from those before it
+MODULES = ("numbers", "camera", "state", "sweeps", "input", "picture", "view")  # each imports from those before it
 SHADERS = ("shared.glsl", "ray.vert", "field.frag", "wall.vert", "wall.frag", "copy.frag")
 
 
@@ -26,19 +25,19 @@ def source(name: str) -> str:
 
 
 def script(last: str) -> str:
-    """The modules, and `last` after them, as one: names are unique, so that imports and exports between them can go."""
+    """The modules and `last` joined into one: names are unique, so imports and exports between them are dropped."""
     joined = "\n".join(source(f"{name}.js") for name in (*MODULES, last))
     joined = re.sub(r"^import .*\n", "", joined, flags=re.MULTILINE)
     return re.sub(r"^export (?!default)", "", joined, flags=re.MULTILINE)
 
 
 def shaders() -> dict[str, str]:
-    """The shaders by the names of their files, but for what only a reader needs: inside JSON there is none."""
-    return {name: re.sub(r"^ +|^ *//.*\n", "", source(name), flags=re.MULTILINE) for name in SHADERS}
+    """The shaders by file name, without comments and indentation."""
+    return {name: re.sub(r"^ +|^ *//.*\n| *//.*$", "", source(name), flags=re.MULTILINE) for name in SHADERS}
 
 
 def compressed(data: bytes) -> bytes:
-    """The arrays as the page unpacks them; equal data give equal bytes."""
+    """The arrays in gzip, which the page unpacks; equal data give equal bytes."""
     return gzip.compress(data, 6, mtime=0)
 
 
@@ -46,12 +45,14 @@ def _json(value: Any) -> str:
     return json.dumps(value, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
 
 
-def page(light: "Illumination") -> str:
-    """One HTML file that holds everything: it opens from the disk and asks no network for anything.
+def page(light: Illumination, up: str | None = None) -> str:
+    """One HTML file that holds everything: it opens from disk and makes no network request.
 
     Parameters
     ----------
     light : Illumination
+    up : str, optional
+        World direction that is up, as in `illumgrid.show.fit_camera`.
 
     Returns
     -------
@@ -60,7 +61,7 @@ def page(light: "Illumination") -> str:
     """
     from illumgrid.show.viewer.packing import packed
 
-    scene, data = packed(light)
+    scene, data = packed(light, up)
     parts = {
         "title": html.escape(scene["title"]) + " · illumgrid",
         "style": source("view.css"),

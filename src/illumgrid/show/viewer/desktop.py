@@ -1,21 +1,18 @@
-"""A sweep in a window of this machine, the isosurface engine of the paper: extraction and lookup for each isovalue.
+"""A sweep in a desktop window: as in the paper, each isovalue is extracted and lit by a lookup.
 
-PyVista and not pyrender's viewer: it has a slider, and it runs wherever VTK does; pyrender's viewer has keys only, and
-needs a release of pyglet that newer systems no longer draw with.
+PyVista has a slider and runs wherever VTK does; pyrender's viewer has keys only, and needs an old release of pyglet.
 """
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from illumgrid.errors import BadInput
-from illumgrid.show.camera import fit_camera
-from illumgrid.show.meshes import solid, wall
+from illumgrid.light import Illumination
+from illumgrid.show.camera import fit_camera, outline_of
 from illumgrid.show.shade import BACKGROUND, Shown
+from illumgrid.show.triangles import solid, wall
 from illumgrid.tone import encode_srgb
-
-if TYPE_CHECKING:
-    from illumgrid.light import Illumination
 
 
 class Window:
@@ -28,7 +25,7 @@ class Window:
         Draw, but open no window.
     """
 
-    def __init__(self, light: "Illumination", off_screen: bool = False) -> None:
+    def __init__(self, light: Illumination, off_screen: bool = False) -> None:
         try:
             import pyvista
         except ImportError as reason:
@@ -50,10 +47,12 @@ class Window:
         )  # fmt: skip
 
     def _look(self, isovalue: float, aspect: float) -> None:
-        """The camera of the still picture."""
-        seen = fit_camera(self.light.scene, self.light.scene.levels_through(0, isovalue)[0], aspect)
+        """The camera of the still picture, which turns about the middle of what it shows."""
+        scene = self.light.scene
+        row = scene.levels_through(0, isovalue)[0]
+        seen, outline = fit_camera(scene, row, aspect), outline_of(scene, row)
+        middle = (outline.min(axis=0) + outline.max(axis=0)) / 2
         camera = self.plotter.camera
-        middle = np.mean([f.volume.origin for f in self.light.scene.fields], axis=0)
         camera.position = seen.eye
         camera.focal_point = seen.eye + max(float((middle - seen.eye) @ seen.forward), 1e-9) * seen.forward
         camera.up = seen.up
@@ -67,7 +66,7 @@ class Window:
         eye = np.asarray(self.plotter.camera.position, float)
         solids = [piece for k, field in enumerate(scene.fields) for piece in solid(shown, k, field, eye)]
         walls = [wall(shown, k, eye) for k in range(len(scene.quads))]
-        for number in range(2 * len(scene.fields) + len(walls)):  # what this isovalue does not have goes
+        for number in range(2 * len(scene.fields) + len(walls)):  # pieces that this isovalue lacks
             self.plotter.remove_actor(f"piece {number}", reset_camera=False, render=False)
         for number, piece in enumerate(solids + walls):
             if not len(piece.faces):
@@ -76,12 +75,12 @@ class Window:
             mesh["rgb"] = encode_srgb(piece.colors)
             self.plotter.add_mesh(
                 mesh, scalars="rgb", rgb=True, lighting=False, name=f"piece {number}", reset_camera=False, render=False,
-                culling="back" if number >= len(solids) else None,  # a wall is seen from its front, wherever one goes
+                culling="back" if number >= len(solids) else None,  # walls are seen from their front only
             )  # fmt: skip
         self.plotter.reset_camera_clipping_range()
         self.plotter.render()
 
 
-def show(light: "Illumination") -> None:
-    """Open a window, until it is closed."""
+def show(light: Illumination) -> None:
+    """Open a window and return when it is closed."""
     Window(light).plotter.show()

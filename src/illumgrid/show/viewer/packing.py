@@ -5,32 +5,26 @@ precision is enough for a graphics card wherever the data lie.
 """
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from illumgrid.field.levelset import turned
-from illumgrid.field.scene import Field, Scene, upright
-from illumgrid.field.volume import Floats, Lattice, Volume, box_corners, index_to_world
-from illumgrid.grid import GridSpec, IlluminationGrid
-from illumgrid.show.camera import HALF_ANGLE, fit_camera, outline_of
+from illumgrid.field.scene import Field, Scene
+from illumgrid.field.volume import Floats, Lattice, box_corners
+from illumgrid.grid import GREY
+from illumgrid.light import Illumination
+from illumgrid.show import trust
+from illumgrid.show.camera import HALF_ANGLE, axes_of, fit_camera, outline_of, up_of
 from illumgrid.show.shade import BACKGROUND, CAP_TONE
+from illumgrid.show.viewer.arrays import HOLE, Bytes, field_steps, pack_light, pack_values, reduced, thinned
 from illumgrid.tone import WHITE, encode_srgb
-
-if TYPE_CHECKING:
-    from illumgrid.light import Illumination
 
 MOST_VOXELS = 2**25
 """Voxels of a field that a page holds: 320³, 64 MB of a graphics card's memory at 16 bits."""
 MOST_NODES = 2**22
 """Nodes of a grid that a page holds: 160³, 32 MB."""
-_STEPS = 65535
-_FINE = 4096  # steps that the swept range must span: else values far outside it are clamped
 _BINS = 96
-_HOLE = -1.0
-_SURE_TO_NOT = np.array([[0, 0.0144, 0.0742], [0.0742, 0.0865, 0.153], [0.376, 0.332, 0.174], [1, 0.823, 0.0612]])
-"""Linear colours of the error, after cividis (Nunez et al. 2018): read alike with and without colour vision."""
 
 
 @dataclass(frozen=True)
@@ -60,83 +54,6 @@ class Stage:
         return result
 
 
-class Bytes:
-    """Arrays, one after the other."""
-
-    def __init__(self) -> None:
-        self.parts: list[bytes] = []
-        self.length = 0
-
-    def add(self, part: bytes) -> int:
-        """Append, and say where it begins."""
-        self.parts.append(part)
-        self.length += len(part)
-        return self.length - len(part)
-
-
-def reduced(volume: Volume, most: int) -> Volume:
-    """Means over blocks of voxels, the same number along each axis, until at most `most` remain."""
-    factor = 1
-    while np.prod([-(-n // factor) for n in volume.shape]) > most:
-        factor += 1
-    if factor == 1:
-        return volume
-    padded = np.pad(volume.values, [(0, -n % factor) for n in volume.shape], mode="edge")
-    split = padded.reshape([k for n in padded.shape for k in (n // factor, factor)])
-    origin = index_to_world(volume, np.full((1, 3), (factor - 1) / 2))[0]
-    return Volume(split.mean(axis=(1, 3, 5)), origin, volume.spacing * factor, volume.direction)
-
-
-def _thinned(grid: IlluminationGrid) -> IlluminationGrid:
-    """Every second, third... node, until a page holds them: a node is never a mean across a surface."""
-    factor = 1
-    while np.prod([-(-n // factor) for n in grid.spec.shape]) > MOST_NODES:
-        factor += 1
-    if factor == 1 or min(grid.spec.shape) <= factor:
-        return grid
-    some = (slice(None, None, factor),) * 3
-    spec = GridSpec(grid.support[some].shape, grid.spec.origin, grid.spec.spacing * factor, grid.spec.direction)
-    return IlluminationGrid(spec, grid.values[some], grid.error[some], grid.support[some])
-
-
-def field_steps(values: NDArray[np.float32], limits: tuple[float, float]) -> tuple[NDArray[Any], float, float, bool]:
-    """Values as whole steps of 8 or 16 bits: (steps, base, step, whether any was clamped); value = base + step · steps.
-
-    Whole numbers that fit stay exact. Others get 65535 steps over all values, or over the swept `limits` and eight
-    times their span on either side where they would get too few of them.
-    """
-    low, high = float(values.min()), float(values.max())
-    if high - low <= _STEPS and max(abs(low), abs(high)) < 2**24 and (values == np.round(values)).all():
-        return (values - low).astype(np.uint8 if high - low < 256 else np.uint16), low, 1.0, False
-    clamped = (limits[1] - limits[0]) * _STEPS < _FINE * (high - low)
-    if clamped:
-        span = limits[1] - limits[0]
-        low, high = max(low, limits[0] - 8 * span), min(high, limits[1] + 8 * span)
-    step = (high - low) / _STEPS or 1.0
-    steps = np.clip(np.round((values.astype(float) - low) / step), 0, _STEPS).astype(np.uint16)
-    return steps, low, step, clamped
-
-
-def _planes(words: NDArray[np.uint16]) -> bytes:
-    """All low bytes, then all high bytes: like lies beside like, and packs better."""
-    return (words & 0xFF).astype(np.uint8).tobytes() + (words >> 8).astype(np.uint8).tobytes()
-
-
-def _pack_values(steps: NDArray[Any], into: Bytes) -> dict[str, Any]:
-    x_fastest = np.ascontiguousarray(steps.transpose(2, 1, 0))
-    x_fastest[:, :, 1:] -= x_fastest[:, :, :-1].copy()  # wraps around, and is undone by adding up
-    data = x_fastest.tobytes() if steps.dtype == np.uint8 else _planes(x_fastest.ravel())
-    return {"shape": list(steps.shape), "bytes": steps.dtype.itemsize, "offset": into.add(data)}
-
-
-def _pack_light(rgb: NDArray[np.floating], error: NDArray[np.floating], into: Bytes) -> dict[str, Any]:
-    """Light (nx, ny, nz, 3) and its error (nx, ny, nz) as half floats, x fastest."""
-    texels = np.concatenate([rgb, error[..., None]], axis=3).transpose(3, 2, 1, 0)
-    half = np.clip(texels, -65504, 65504).astype(np.float16).view(np.uint16).reshape(4, -1)
-    half[1:3] -= half[0]  # white light packs to a third
-    return {"shape": list(rgb.shape[:3]), "offset": into.add(b"".join(_planes(channel) for channel in half))}
-
-
 def _histogram(field: Field) -> dict[str, Any]:
     """Voxels over the swept range and a third of its span on either side, as far as there are data."""
     values, (low, high) = field.volume.values, field.range
@@ -147,28 +64,21 @@ def _histogram(field: Field) -> dict[str, Any]:
     return {"counts": counts.tolist(), "limits": [float(low), float(high)]}
 
 
-def _field(light: "Illumination", number: int, stage: Stage, into: Bytes, notes: list[str]) -> dict[str, Any]:
-    field, whole, grid = light.scene.fields[number], light.grids[number], _thinned(light.grids[number])
-    volume = reduced(field.volume, MOST_VOXELS)
+def _field(light: Illumination, number: int, stage: Stage, into: Bytes, notes: list[str]) -> dict[str, Any]:
+    field, whole = light.scene.fields[number], light.grids[number]
+    volume, grid = reduced(field.volume, MOST_VOXELS), thinned(whole, MOST_NODES)
     sign = field.upward
     ends = sorted(sign * field.range)
     steps, base, step, clamped = field_steps(turned(volume, field.inside), (ends[0], ends[1]))
-    for what, before, after in (
-        ("field", field.volume.shape, volume.shape),
-        ("light", whole.spec.shape, grid.spec.shape),
-    ):
-        if before != after:
-            sizes = " to ".join("\u2009×\u2009".join(map(str, shape)) for shape in (before, after))
-            notes.append(
-                f"The {what} of {field.name} was reduced for this page from {sizes} "
-                f"{'voxels' if what == 'field' else 'nodes'}."
-            )
+    _note_reduced(notes, f"The field of {field.name}", "voxels", field.volume.shape, volume.shape)
+    _note_reduced(notes, f"The light of {field.name}", "nodes", whole.spec.shape, grid.spec.shape)
     if clamped:
         notes.append(f"Values of {field.name} far outside the swept range were clamped for this page.")
-    shown = light.exposure / np.pi
     texture = np.diag([*(1 / np.array(grid.spec.shape)), 1.0])
     texture[:3, 3] = 0.5 / np.array(grid.spec.shape)
     albedo = field.material.albedo
+    error = np.where(np.isfinite(grid.bar), trust.relative(whole, grid.bar), HOLE)
+    shown = grid.light if grid.channels == GREY else grid.values
     return {
         "name": field.name,
         "range": field.range.tolist(),
@@ -176,27 +86,37 @@ def _field(light: "Illumination", number: int, stage: Stage, into: Bytes, notes:
         "albedo": albedo.tolist(),
         "swatch": _css(WHITE * albedo / albedo.max(initial=1e-9)),
         "histogram": _histogram(field),
-        "values": _pack_values(steps, into) | {"base": base, "step": step},
-        "light": _pack_light(grid.values * shown, np.where(np.isfinite(grid.bar), grid.bar * shown, _HOLE), into),
+        "values": pack_values(steps, into) | {"base": base, "step": step},
+        "light": pack_light(shown * (light.exposure / np.pi), error, into),
         "toIndex": stage.to_index(volume).T.ravel().tolist(),
         "toTexture": (texture @ stage.to_index(grid.spec)).T.ravel().tolist(),
     }
+
+
+def _note_reduced(
+    notes: list[str], what: str, points: str, before: tuple[int, int, int], after: tuple[int, int, int]
+) -> None:
+    if before != after:
+        sizes = " to ".join("\u2009×\u2009".join(map(str, shape)) for shape in (before, after))
+        notes.append(f"{what} was reduced for this page from {sizes} {points}.")
 
 
 def _css(linear: Floats) -> str:
     return "#" + "".join(f"{int(c):02x}" for c in encode_srgb(linear))
 
 
-def _walls(light: "Illumination", stage: Stage, into: Bytes) -> tuple[list[dict[str, Any]], dict[str, Any] | None]:
+def _walls(light: Illumination, stage: Stage, into: Bytes) -> tuple[list[dict[str, Any]], dict[str, Any] | None]:
     """The quads, and the light of all of them side by side in one texture (u, v, sweep)."""
     quads = light.scene.quads
     if not quads:
         return [], None
     rows, wide, high = len(light.levels.table), sum(q.texels[0] for q in quads), max(q.texels[1] for q in quads)
-    atlas, offset, described = np.zeros((wide, high, rows, 3), np.float32), 0, []
+    grey = all(wall.channels == GREY for wall in light.walls)
+    atlas, offset, described = np.zeros((wide, high, rows, 1 if grey else 3), np.float32), 0, []
     for quad, wall in zip(quads, light.walls):
         nu, nv = quad.texels
-        atlas[offset : offset + nu, :nv] = wall.values.transpose(2, 1, 0, 3) * (light.exposure / np.pi)
+        lit = wall.light if grey else wall.values
+        atlas[offset : offset + nu, :nv] = lit.transpose(2, 1, 0, 3) * (light.exposure / np.pi)
         material = quad.material
         described.append(
             {
@@ -212,16 +132,16 @@ def _walls(light: "Illumination", stage: Stage, into: Bytes) -> tuple[list[dict[
             }
         )
         offset += nu
-    return described, _pack_light(atlas, np.zeros(atlas.shape[:3]), into)
+    return described, pack_light(atlas, np.zeros(atlas.shape[:3]), into)
 
 
-def _opening(scene: Scene, stage: Stage) -> dict[str, Any]:
+def _opening(scene: Scene, stage: Stage, up: str | None) -> dict[str, Any]:
     """The view of the still picture at the middle of the sweep, and the hull that it must hold."""
     from scipy.spatial import ConvexHull, QhullError
 
     row = scene.levels(0.5)[0]
-    right, front, up = upright(scene.fields[0].volume.direction)
-    forward = fit_camera(scene, row, 1.0).forward
+    right, front, upright = axes_of(scene.fields[0].volume.direction, up or up_of(scene))
+    forward = fit_camera(scene, row, 1.0, up=up).forward
     points = stage.place(outline_of(scene, row))
     try:
         points = points[ConvexHull(points).vertices]
@@ -229,20 +149,9 @@ def _opening(scene: Scene, stage: Stage) -> dict[str, Any]:
         points = np.array(list(np.ndindex(2, 2, 2))) * np.ptp(points, axis=0) + points.min(axis=0)
     return {
         "azimuth": float(np.arctan2(-forward @ right, -forward @ front)),
-        "elevation": float(np.arcsin(np.clip(-forward @ up, -1, 1))),
+        "elevation": float(np.arcsin(np.clip(-forward @ upright, -1, 1))),
         "outline": np.round(points, 4).tolist(),
     }
-
-
-def _doubt(light: "Illumination") -> float:
-    """The relative error that gets the last colour: what 95 % of the nodes stay below, rounded up."""
-    relative = []
-    for grid in light.grids:
-        known = np.isfinite(grid.bar) & (grid.values.mean(axis=3) > 0)
-        relative.append(grid.bar[known] / grid.values[known].mean(axis=1))
-    joined = np.concatenate(relative)
-    worst = float(np.quantile(joined, 0.95)) if len(joined) else 0.0
-    return float(np.clip(np.ceil(worst * 50) / 50, 0.02, 1.0))
 
 
 def _between(colors: Floats, steps: int = 13) -> Floats:
@@ -251,8 +160,8 @@ def _between(colors: Floats, steps: int = 13) -> Floats:
     return np.stack([np.interp(at, np.arange(len(colors)), channel) for channel in colors.T], axis=1)
 
 
-def packed(light: "Illumination") -> tuple[dict[str, Any], bytes]:
-    """Description of a scene for the page, and the arrays that it points into."""
+def packed(light: Illumination, up: str | None = None) -> tuple[dict[str, Any], bytes]:
+    """Description of a scene for the page, and the arrays that it points into; `up` as in `fit_camera`."""
     scene, into = light.scene, Bytes()
     stage, notes = Stage.of(scene), list[str]()
     fields = [_field(light, number, stage, into, notes) for number in range(len(scene.fields))]
@@ -262,16 +171,19 @@ def packed(light: "Illumination") -> tuple[dict[str, Any], bytes]:
     described = {
         "title": ", ".join(f.name for f in scene.fields),
         "subtitle": f"Global light from an illumination grid; {several}.",
-        "notes": notes,
-        "axes": [axis.tolist() for axis in upright(scene.fields[0].volume.direction)],
+        "notes": [*notes, *(f"Error bars: {doubt}." for doubt in trust.doubts(light))],
+        "axes": [axis.tolist() for axis in axes_of(scene.fields[0].volume.direction, up or up_of(scene))],
         "tangent": HALF_ANGLE,
-        "opening": _opening(scene, stage),
+        "opening": _opening(scene, stage, up),
         "background": BACKGROUND,
         "capTone": CAP_TONE,
         "white": WHITE,
-        "trust": _doubt(light),
-        "trustScale": _SURE_TO_NOT.tolist(),
-        "trustColors": [_css(color) for color in _between(_SURE_TO_NOT)],
+        "trust": {
+            "ends": [trust.LOW, trust.HIGH],
+            "scale": trust.SCALE.tolist(),
+            "hatch": trust.HATCH.tolist(),
+            "colors": [_css(color) for color in _between(trust.SCALE.astype(float))],
+        },
         "fields": fields,
         "walls": walls,
         "atlas": atlas,

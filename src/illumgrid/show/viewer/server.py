@@ -1,4 +1,4 @@
-"""The page on this machine's own address, for nobody else."""
+"""Serve the page to this machine only."""
 
 import sys
 from http import HTTPStatus
@@ -6,7 +6,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 
 class PageServer(ThreadingHTTPServer):
-    """One page at ``/`` of 127.0.0.1, on a port that was free."""
+    """One page at ``/`` of 127.0.0.1, on a free port."""
 
     daemon_threads = True
 
@@ -20,7 +20,7 @@ class PageServer(ThreadingHTTPServer):
         return f"http://127.0.0.1:{self.server_address[1]}/"
 
     def handle_error(self, request: object, client_address: object) -> None:
-        """A browser that hangs up is no trouble; anything else is told as ever."""
+        """Ignore a browser that hangs up; report anything else as usual."""
         if not isinstance(sys.exception(), ConnectionError):
             super().handle_error(request, client_address)  # type: ignore[arg-type]
 
@@ -29,9 +29,9 @@ class _Answer(BaseHTTPRequestHandler):
     server: PageServer
 
     def do_GET(self) -> None:
-        """Answer with the page, to who asks for it by this machine's own name."""
-        asked = (self.headers.get("Host") or "").rpartition(":")[0]
-        if asked not in ("127.0.0.1", "localhost"):  # a name on the web that was pointed here
+        """Answer with the page if it was requested by the name of this machine."""
+        host = (self.headers.get("Host") or "").rpartition(":")[0]
+        if host not in ("127.0.0.1", "localhost"):  # a foreign name that resolves to this machine (DNS rebinding)
             self.send_error(HTTPStatus.FORBIDDEN)
         elif self.path.partition("?")[0] != "/":
             self.send_error(HTTPStatus.NOT_FOUND)
@@ -44,9 +44,9 @@ class _Answer(BaseHTTPRequestHandler):
             self.wfile.write(self.server.page)
 
     def log_message(self, format: str, *args: object) -> None:
-        """Say nothing: the terminal is the user's."""
+        """Write nothing: the terminal belongs to the command."""
 
 
 def serve(page: bytes) -> PageServer:
-    """A server that listens; ``serve_forever`` answers, leaving the ``with`` closes it."""
+    """A listening server; ``serve_forever`` answers, leaving the ``with`` block closes it."""
     return PageServer(page)

@@ -1,15 +1,13 @@
 """The page in a notebook, by anywidget: Jupyter, VS Code, Colab."""
 
 from functools import cache
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from illumgrid.errors import BadInput
+from illumgrid.light import Illumination
 from illumgrid.show.viewer import compressed, script, shaders, source
-
-if TYPE_CHECKING:
-    from illumgrid.light import Illumination
 
 
 @cache
@@ -24,7 +22,7 @@ def _widget_class() -> type[Any]:
         ) from reason
 
     class View(anywidget.AnyWidget):  # type: ignore[misc, unused-ignore]
-        """A view of a lit scene; `isovalue`, of the first field, follows the slider and leads it."""
+        """A view of a lit scene; `isovalue`, of the first field, follows the slider and sets it."""
 
         _esm = script("widget")
         isovalue = traitlets.Float().tag(sync=True)
@@ -45,7 +43,7 @@ def _widget_class() -> type[Any]:
     return View
 
 
-def widget(light: "Illumination", isovalue: float | None = None, height: int = 520) -> Any:
+def widget(light: Illumination, isovalue: float | None = None, height: int = 520) -> Any:
     """A widget that shows `light`; see `Illumination.show`."""
     import json
 

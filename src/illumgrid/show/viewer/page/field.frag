@@ -1,14 +1,13 @@
-// One field: the ray meets the level set of the trilinear interpolant, exactly as the pictures and the paths do.
+// One field: where the ray meets the level set of the trilinear interpolant, as in the pictures and the light paths.
 const int BRICK = 4;                 // cells along the side of a brick, as in numbers.js
 const int NOTHING = 0, SURFACE = 1, CAP = 2;
 
 uniform usampler3D uField;           // voxel values in steps, turned so that the solid is upwards
 uniform usampler3D uBricks;          // least and largest value of each brick
-uniform sampler3D uLight;            // rgb: light, scaled for the screen; a: its standard error, -1 in a hole
+uniform sampler3D uLight;            // exposed light, then its relative error: -1 in a hole
 uniform mat4 uToIndex, uToTexture;   // from the stage to voxel indices, and to texture coordinates of the light
 uniform float uLevel;                // isovalue in steps
 uniform vec3 uAlbedo;
-uniform float uCapTone;
 uniform bool uBothSides;             // a translucent surface is seen from its back too
 uniform vec3 uEye;
 uniform sampler2D uFront;            // depth of the layer in front, when layers are peeled
@@ -156,22 +155,21 @@ vec3 gradient(vec3 index) {
   return vec3(y.y - y.x, mix(z.z - z.x, z.w - z.y, f.x), mix(mix(r.x - n.x, r.y - n.y, f.x), mix(r.z - n.z, r.w - n.w, f.x), f.y));
 }
 
-// Error over light at a place, from the nodes around that know theirs; -1 where the nearest node is a hole.
+// Relative error of the lookup at a place; -1 where it mixes a node without light of its own.
 float doubt(vec3 place) {
   ivec3 size = textureSize(uLight, 0);
   vec3 node = clamp(place * vec3(size) - 0.5, vec3(0.0), vec3(size - 1));
   ivec3 cell = min(ivec3(floor(node)), size - 2);
   vec3 f = node - vec3(cell);
-  if (texelFetch(uLight, cell + ivec3(round(f)), 0).a < 0.0) return -1.0;
-  float error = 0.0, weight = 0.0;
+  float error = 0.0;
   for (int k = 0; k < 8; k++) {
     ivec3 corner = ivec3(k & 1, (k >> 1) & 1, k >> 2);
     vec3 w = mix(1.0 - f, f, vec3(corner));
-    float e = texelFetch(uLight, cell + corner, 0).a, share = e < 0.0 ? 0.0 : w.x * w.y * w.z;
+    float e = errorOf(texelFetch(uLight, cell + corner, 0)), share = w.x * w.y * w.z;
+    if (share > 0.0 && e < 0.0) return -1.0;
     error += share * e;
-    weight += share;
   }
-  return error / weight / max(dot(texture(uLight, place).rgb, vec3(1.0 / 3.0)), 1e-6);
+  return error;
 }
 
 void main() {
@@ -186,18 +184,18 @@ void main() {
   if (what == NOTHING) discard;
   gl_FragDepth = depthOf(t);
   vec3 place = uEye + t * ray;
-  if (what == CAP) { draw(uCapTone * uAlbedo, 1.0); return; }
+  if (what == CAP) { draw(uCapTone * (isTrust() ? vec3(0.5) : uAlbedo), 1.0); return; }
   vec3 texel = (uToTexture * vec4(place, 1.0)).xyz;
   bool local = isLocal();
   vec3 normal = vec3(0.0);
-  if (local || uLook != MATTE || uTrust > 0.0) {
+  if (local || uLook != MATTE || isTrust()) {
     normal = -normalize(transpose(mat3(uToIndex)) * gradient((uToIndex * vec4(place, 1.0)).xyz));
   }
   float facing = abs(dot(normal, ray));
-  if (uTrust > 0.0) { draw(trusted(doubt(texel)) * (0.65 + 0.35 * facing), 1.0); return; }
-  vec3 color;
+  if (isTrust()) { draw(trusted(doubt(texel)) * (0.4 + 0.6 * facing), 1.0); return; }
+  vec3 color, light = lightOf(texture(uLight, texel));
   if (local) color = uGain * uWhite * uAlbedo / max(most(uAlbedo), 1e-9) * max(-dot(normal, ray), uBothSides ? facing : 0.0);
-  else color = uGain * uAlbedo * texture(uLight, texel).rgb;
-  if (uLook == SHINY) color = 0.8 * color + gloss(normal, ray, local ? vec3(uWhite) : texture(uLight, texel).rgb);
-  draw(color, uLook == TRANSLUCENT ? 1.0 - pow(0.62, 1.0 / max(facing, 0.12)) : 1.0);
+  else color = uGain * uAlbedo * light;
+  if (uLook == SHINY) color = 0.8 * color + gloss(normal, ray, local ? vec3(uWhite) : light);
+  draw(curve(color), uLook == TRANSLUCENT ? 1.0 - pow(0.62, 1.0 / max(facing, 0.12)) : 1.0);
 }

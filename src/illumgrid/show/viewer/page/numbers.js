@@ -1,4 +1,4 @@
-// From the bytes in the page to arrays that the graphics card takes.
+// From the bytes in the page to arrays for the graphics card.
 
 const BRICK = 4; // cells along the side of a brick, as in field.frag
 
@@ -17,7 +17,7 @@ export async function inflate(bytes) {
   return new Uint8Array(await new Response(stream).arrayBuffer());
 }
 
-// Numbers of 16 bits lie as all low bytes, then all high bytes.
+// Numbers of 16 bits are stored as all low bytes, then all high bytes.
 function words(bytes, count) {
   const result = new Uint16Array(count);
   for (let i = 0; i < count; i++) result[i] = bytes[i] | (bytes[count + i] << 8);
@@ -36,20 +36,14 @@ export function fieldValues(bytes, about) {
   return values;
 }
 
-// Half floats, four a texel; green and blue are written as differences to red.
+// Half floats: one channel of light or three, then the error; green and blue are differences to red.
 export function lightTexels(bytes, about) {
-  const count = about.shape[0] * about.shape[1] * about.shape[2];
-  const channels = [0, 1, 2, 3].map((k) => {
-    const from = about.offset + 2 * count * k;
-    return words(bytes.subarray(from, from + 2 * count), count);
-  });
-  const texels = new Uint16Array(4 * count);
-  for (let i = 0; i < count; i++) {
-    const red = channels[0][i];
-    texels[4 * i] = red;
-    texels[4 * i + 1] = red + channels[1][i];
-    texels[4 * i + 2] = red + channels[2][i];
-    texels[4 * i + 3] = channels[3][i];
+  const count = about.shape[0] * about.shape[1] * about.shape[2], each = about.channels + 1;
+  const texels = new Uint16Array(each * count);
+  for (let k = 0; k < each; k++) {
+    const from = about.offset + 2 * count * k, channel = words(bytes.subarray(from, from + 2 * count), count);
+    const difference = k > 0 && k < about.channels;
+    for (let i = 0; i < count; i++) texels[each * i + k] = channel[i] + (difference ? texels[each * i] : 0);
   }
   return texels;
 }

@@ -1,4 +1,4 @@
-// A page of its own: unpack what it carries, and begin.
+// A standalone page: unpack its data and start the view.
 
 import { unpack } from "./numbers.js";
 import { complain, view } from "./view.js";

@@ -87,8 +87,8 @@ export class Picture {
   }
 
   light(about, data) {
-    const gl = this.gl;
-    return this.volume(gl.RGBA16F, gl.RGBA, gl.HALF_FLOAT, about.shape, lightTexels(data, about), gl.LINEAR);
+    const gl = this.gl, [format, layout] = about.channels === 1 ? [gl.RG16F, gl.RG] : [gl.RGBA16F, gl.RGBA];
+    return this.volume(format, layout, gl.HALF_FLOAT, about.shape, lightTexels(data, about), gl.LINEAR);
   }
 
   // A place to draw into: half-float colour, and a depth that can be read back.
@@ -142,10 +142,12 @@ export class Picture {
       ...seen,
       uWhite: scene.white,
       uGain: 2 ** state.stops,
-      uLocalFrom: state.light === "local" ? -1 : state.light === "both" ? state.split * this.size[0] : 1e9,
+      uLocalUpTo: state.light === "local" ? 1e9 : state.light === "both" ? state.split * this.size[0] : -1,
       uLook: LOOKS.indexOf(state.look),
-      uTrust: state.trust ? scene.trust : 0,
-      "uScale[0]": scene.trustScale.flat(),
+      uCapTone: scene.capTone,
+      uTrust: state.trust ? scene.trust.ends : [0, 0],
+      "uScale[0]": scene.trust.scale.flat(),
+      "uHatch[0]": scene.trust.hatch.flat(),
       uPeel: front ? 1 : 0,
       uFront: this.bind(3, gl.TEXTURE_2D, front ? front.depth : null),
     };
@@ -160,15 +162,15 @@ export class Picture {
         uToTexture: field.toTexture,
         uLevel: (this.level(field, state.sweep) - field.values.base) / field.values.step,
         uAlbedo: field.albedo,
-        uCapTone: scene.capTone,
+        uGrey: field.light.channels === 1 ? 1 : 0,
         uBothSides: translucent ? 1 : 0,
       });
       gl.drawArrays(gl.TRIANGLES, 0, 3);
     });
     gl.useProgram(this.wallProgram.built);
-    set(gl, this.wallProgram, { ...common, uLook: 0 });
+    set(gl, this.wallProgram, { ...common, uLook: 0, uGrey: scene.atlas?.channels === 1 ? 1 : 0 });
     for (const wall of scene.walls) {
-      if (dot(wall.normal, sum([1, seen.uEye], [-1, wall.corner])) <= 0) continue; // a wall seen from behind is not there
+      if (dot(wall.normal, sum([1, seen.uEye], [-1, wall.corner])) <= 0) continue; // walls are drawn from their front only
       set(gl, this.wallProgram, {
         uWalls: this.bind(0, gl.TEXTURE_3D, this.walls),
         uCorner: wall.corner, uEdgeU: wall.edgeU, uEdgeV: wall.edgeV, uNormal: wall.normal,
@@ -242,7 +244,7 @@ export class Picture {
     this.copy(this.mean, null, null, true);
   }
 
-  // Wait for the graphics card: what a frame costs is known only then.
+  // Wait for the graphics card, so that the time of a frame can be measured.
   wait() {
     const gl = this.gl;
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.mean.frame);

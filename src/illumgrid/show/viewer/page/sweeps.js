@@ -2,7 +2,7 @@
 
 import { isovalueOf, sweepOf } from "./state.js";
 
-export function said(field, isovalue) {
+export function formatted(field, isovalue) {
   const span = field.range[1] - field.range[0];
   const digits = Math.ceil(-Math.log10(span / 400));
   return digits > 8 || span > 1e7 ? isovalue.toPrecision(5) : isovalue.toFixed(Math.max(0, digits));
@@ -44,14 +44,14 @@ function sweep(field, number, many, put) {
   band.style.width = `${100 * (to - from)}%`;
   histogram.append(band, slider);
   const ends = field.range.map((end, k) => {
-    const label = element("span", {}, [said(field, end)]);
+    const label = element("span", {}, [formatted(field, end)]);
     label.style.left = `${100 * (k ? to : from)}%`;
     return label;
   });
   const dot = element("i");
   dot.style.background = field.swatch;
   const label = element("label", {}, many ? [dot, field.name] : ["Isovalue"]);
-  const box = element("div", { class: "sweep", title: `The light was computed for isovalues from ${said(field, field.range[0])} to ${said(field, field.range[1])}` }, [
+  const box = element("div", { class: "sweep", title: `The light was computed for isovalues from ${formatted(field, field.range[0])} to ${formatted(field, field.range[1])}` }, [
     element("div", { class: "head" }, [label, typed]),
     histogram,
     element("div", { class: "limits", "aria-hidden": "true" }, ends),
@@ -62,7 +62,7 @@ function sweep(field, number, many, put) {
     typed.value = slider.getAttribute("aria-valuetext");
   });
   const show = (share) => {
-    const isovalue = isovalueOf(field, share), text = said(field, isovalue);
+    const isovalue = isovalueOf(field, share), text = formatted(field, isovalue);
     if (Math.abs(Number(slider.value) - isovalue) > 1e-9 * (field.range[1] - field.range[0])) slider.value = isovalue;
     slider.setAttribute("aria-valuetext", text);
     typed.value = text;

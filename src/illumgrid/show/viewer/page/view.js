@@ -1,22 +1,22 @@
 // The page: a state, the picture of it, and the controls that change it.
 
 import { fitted } from "./camera.js";
-import { listen, listenSplit } from "./hands.js";
+import { listen, listenSplit } from "./input.js";
 import { LOOKS, Picture } from "./picture.js";
 import { DEFAULTS, clamp, isovalueOf, read, written } from "./state.js";
-import { said, sweeps } from "./sweeps.js";
+import { formatted, sweeps } from "./sweeps.js";
 
-const REST = 160; // milliseconds without a change: the hand rests
-const SMOOTH = 30; // milliseconds for a frame while the hand moves
-const QUICK = 60; // a frame this quick is refined beyond the four samples of a still picture
+const REST = 160; // milliseconds without a change until a full frame is drawn
+const SMOOTH = 30; // milliseconds per frame during interaction
+const QUICK = 60; // frames faster than this are refined beyond the four samples of a still picture
 
 // Places within the pixel: first the middles of its four quarters, as in a still picture of the package, then between.
 const PLACES = [[0.25, 0.25], [0.75, 0.75], [0.75, 0.25], [0.25, 0.75]].concat(
   [...Array(12).keys()].map((k) => [(0.5 + 0.7548777 * (k + 1)) % 1, (0.5 + 0.5698403 * (k + 1)) % 1]),
 );
 
-// Brings `root`, which holds the markup, to life. Options: address (keep the state there), hear (told of every change).
-export function view(root, scene, data, shaders, { address = true, hear = () => {} } = {}) {
+// Runs the view in `root`, which holds the markup. Options: address (keep the state there), onChange (called with the state).
+export function view(root, scene, data, shaders, { address = true, onChange = () => {} } = {}) {
   const part = (name) => root.querySelector(`[data-part="${name}"]`);
   const canvas = part("canvas"), stage = part("stage");
   const picture = new Picture(canvas, scene, data, shaders);
@@ -37,13 +37,13 @@ export function view(root, scene, data, shaders, { address = true, hear = () => 
     }
     part("effect").hidden = state.look === "matte";
     part("stops").value = state.stops;
-    part("stopsSaid").value = `${state.stops > 0 ? "+" : state.stops < 0 ? "\u2212" : "\u00b1"}${Math.abs(state.stops).toFixed(1)} EV`;
+    part("stopsShown").value = `${state.stops > 0 ? "+" : state.stops < 0 ? "\u2212" : "\u00b1"}${Math.abs(state.stops).toFixed(1)} EV`;
     part("trust").checked = state.trust;
     part("legend").hidden = !state.trust;
     part("split").hidden = state.light !== "both" || state.trust;
     part("split").style.left = `${100 * state.split}%`;
     part("split").setAttribute("aria-valuenow", Math.round(100 * state.split));
-    const isovalues = scene.fields.map((f) => `${f.name} at ${said(f, isovalueOf(f, state.sweep))}`).join(", ");
+    const isovalues = scene.fields.map((f) => `${f.name} at ${formatted(f, isovalueOf(f, state.sweep))}`).join(", ");
     canvas.setAttribute("aria-label", `Isosurface of ${isovalues}, ${state.light} light`);
   }
 
@@ -55,7 +55,7 @@ export function view(root, scene, data, shaders, { address = true, hear = () => 
     samples = 0;
     controls();
     draw();
-    hear(state);
+    onChange(state);
   }
 
   function draw() {
@@ -115,7 +115,7 @@ export function view(root, scene, data, shaders, { address = true, hear = () => 
     canvas.toBlob((blob) => {
       const link = document.createElement("a");
       link.href = URL.createObjectURL(blob);
-      const isovalue = said(scene.fields[0], isovalueOf(scene.fields[0], state.sweep));
+      const isovalue = formatted(scene.fields[0], isovalueOf(scene.fields[0], state.sweep));
       link.download = `${scene.fields.map((f) => f.name).join("-").replace(/[^\p{L}\p{N}.-]+/gu, "_")}-${isovalue}.png`;
       link.click();
       setTimeout(() => URL.revokeObjectURL(link.href), 1000);
@@ -132,11 +132,13 @@ export function view(root, scene, data, shaders, { address = true, hear = () => 
   part("trust").addEventListener("change", () => put({ trust: part("trust").checked }));
   part("reset").addEventListener("click", reset);
   part("save").addEventListener("click", save);
-  canvas.addEventListener("webglcontextlost", () => complain(root, "The graphics card was reset. Reload the page to go on."));
+  canvas.addEventListener("webglcontextlost", () => complain(root, "The graphics card was reset. Reload the page to continue."));
   part("title").textContent = scene.title;
   part("subtitle").textContent = scene.subtitle;
-  part("worst").textContent = `${Number((100 * scene.trust).toPrecision(2))} % or more`;
-  part("legend").style.setProperty("--scale", `linear-gradient(90deg, ${scene.trustColors.join(", ")})`);
+  const [least, most] = scene.trust.ends.map((end) => `${Number((100 * end).toPrecision(2))} %`);
+  part("least").textContent = `< ${least}`;
+  part("most").textContent = `> ${most}`;
+  part("legend").style.setProperty("--scale", `linear-gradient(90deg, ${scene.trust.colors.join(", ")})`);
   part("notes").replaceChildren(...scene.notes.map((text) => Object.assign(document.createElement("p"), { textContent: text })));
   new ResizeObserver(draw).observe(stage);
   const view_ = { state, put, picture, took: 0 };

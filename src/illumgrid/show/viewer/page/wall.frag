@@ -16,8 +16,9 @@ void main() {
   if (uPeel && depth <= texelFetch(uFront, ivec2(gl_FragCoord.xy), 0).r + 1e-6) discard;
   gl_FragDepth = depth;
   vec2 texel = uOffset + clamp(vPlace * uTexels, vec2(0.5), uTexels - 0.5);
-  vec3 light = texture(uWalls, vec3(texel / vec2(textureSize(uWalls, 0).xy), uRow)).rgb;
-  if (uTrust > 0.0) { draw(vec3(0.12), 1.0); return; }
-  if (isLocal()) draw(uGain * uWhite * uLocalColor * abs(dot(uNormal, normalize(vRay))), 1.0);
-  else draw(uGain * (uAlbedo * light + uEmission), 1.0);
+  vec3 light = lightOf(texture(uWalls, vec3(texel / vec2(textureSize(uWalls, 0).xy), uRow)));
+  float facing = abs(dot(uNormal, normalize(vRay)));
+  if (isTrust()) { draw(vec3(0.5 * uCapTone * facing), 1.0); return; }
+  if (isLocal()) draw(curve(uGain * uWhite * uLocalColor * facing), 1.0);
+  else draw(curve(uGain * (uAlbedo * light + uEmission)), 1.0);
 }

@@ -1,4 +1,4 @@
-// The same view in a notebook: anywidget hands a model whose traits follow the hand, and lead it.
+// The same view in a notebook: the traits of the anywidget model follow the view, and set it.
 
 import { inflate } from "./numbers.js";
 import { complain, view } from "./view.js";
@@ -17,18 +17,18 @@ async function render({ model, el }) {
     const near = (a, b) => Math.abs(a - b) < 1e-9 * (high - low);
     const shown = view(root, scene, data, JSON.parse(model.get("_shaders")), {
       address: false,
-      hear: (state) => {
+      onChange: (state) => {
         if (near(model.get("isovalue"), isovalue(state.sweep))) return;
         model.set("isovalue", isovalue(state.sweep));
         model.save_changes();
       },
     });
-    const lead = () => {
+    const follow = () => {
       if (!near(model.get("isovalue"), isovalue(shown.state.sweep))) shown.put({ sweep: (model.get("isovalue") - low) / (high - low) });
     };
-    model.on("change:isovalue", lead);
-    lead();
-    return () => model.off("change:isovalue", lead);
+    model.on("change:isovalue", follow);
+    follow();
+    return () => model.off("change:isovalue", follow);
   } catch (error) {
     complain(root, error.message);
   }

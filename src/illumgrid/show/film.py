@@ -3,50 +3,25 @@
 import importlib.util
 import io
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from illumgrid.errors import BadInput
-
-if TYPE_CHECKING:
-    from illumgrid.field.scene import Scene
-    from illumgrid.light import Illumination
-
-Picture = NDArray[np.uint8]
+from illumgrid.light import Illumination
+from illumgrid.show.captions import Picture, isovalues_of, labelled
 
 SECONDS, SHORTEST, LONGEST = 4.0, 0.04, 0.5
-"""A film lasts this long, as far as no frame stands shorter or longer than this many seconds."""
+"""Seconds that a film lasts, and bounds on those of each frame."""
 ENDINGS = (".gif", ".webp", ".mp4")
 
 
-def frames(light: "Illumination", field: str | None, count: int, draw: Callable[[float], Picture]) -> Iterator[Picture]:
+def frames(light: Illumination, field: str | None, count: int, draw: Callable[[float], Picture]) -> Iterator[Picture]:
     """`count` pictures by `draw`, called with equal steps of the isovalue of `field` through its range."""
     scene = light.scene
     number = scene.number_of(field)
     for row in scene.levels(np.linspace(0.0, 1.0, count)):
         yield labelled(draw(float(row[number])), isovalues_of(scene, row))
-
-
-def isovalues_of(scene: "Scene", row: NDArray[np.float64]) -> str:
-    """Isovalues (F,) as a line of text; with names where there are several."""
-    if len(row) == 1:
-        return f"{row[0]:.4g}"
-    return ",  ".join(f"{field.name}: {isovalue:.4g}" for field, isovalue in zip(scene.fields, row))
-
-
-def labelled(picture: Picture, text: str) -> Picture:
-    """A picture (height, width, 3) with a line of text in its lower left corner, light or dark as its ground wants."""
-    from PIL import Image, ImageDraw, ImageFont
-
-    height = picture.shape[0]
-    size = max(12, height // 32)
-    image = Image.fromarray(picture)
-    tone = 225 if picture[-size:, : 4 * size].mean() < 128 else 40
-    place = size // 2, height - size // 2
-    ImageDraw.Draw(image).text(place, text, (tone,) * 3, ImageFont.load_default(size), anchor="ls")
-    return np.asarray(image)
 
 
 def check_ending(name: str, ending: str) -> None:
@@ -65,9 +40,9 @@ def check_ending(name: str, ending: str) -> None:
 
 def film(pictures: list[Picture], ending: str) -> bytes:
     """Pictures of one size as a film that starts again at its end: ``.gif``, ``.webp`` or ``.mp4``."""
-    stands = min(max(SECONDS / len(pictures), SHORTEST), LONGEST)
+    shown_for = min(max(SECONDS / len(pictures), SHORTEST), LONGEST)
     if ending == ".mp4":
-        return _mp4(pictures, 1 / stands)
+        return _mp4(pictures, 1 / shown_for)
     from PIL import Image
 
     options: dict[str, Any]
@@ -77,7 +52,7 @@ def film(pictures: list[Picture], ending: str) -> bytes:
         images, options = [Image.fromarray(p) for p in pictures], {"quality": 88, "method": 4}
     buffer = io.BytesIO()
     images[0].save(
-        buffer, ending[1:], save_all=True, append_images=images[1:], duration=round(1000 * stands), loop=0, **options
+        buffer, ending[1:], save_all=True, append_images=images[1:], duration=round(1000 * shown_for), loop=0, **options
     )
     return buffer.getvalue()
 

@@ -1,4 +1,4 @@
-// Mouse, touch and keys on the picture become new views.
+// Mouse, touch and keys on the picture change the view.
 
 import { orbited, panned, zoomed } from "./camera.js";
 
@@ -9,14 +9,14 @@ export function listen(canvas, scene, get, put, reset) {
   let spread = null;
   const pan = (x, y) => put(panned(get(), scene.axes, scene.tangent, x, y));
   const middle = () => [...held.values()].reduce(([x, y], p) => [x + p[0] / held.size, y + p[1] / held.size], [0, 0]);
-  const apart = () => {
+  const spacing = () => {
     const [a, b] = [...held.values()];
     return held.size === 2 ? Math.hypot(a[0] - b[0], a[1] - b[1]) : null;
   };
   canvas.addEventListener("pointerdown", (event) => {
     canvas.setPointerCapture(event.pointerId);
     held.set(event.pointerId, [event.clientX, event.clientY]);
-    spread = apart();
+    spread = spacing();
   });
   canvas.addEventListener("pointermove", (event) => {
     if (!held.has(event.pointerId)) return;
@@ -26,7 +26,7 @@ export function listen(canvas, scene, get, put, reset) {
     const [x, y] = [after[0] - before[0], after[1] - before[1]];
     if (held.size === 2) {
       pan((2 * x) / height, (-2 * y) / height);
-      const now = apart();
+      const now = spacing();
       if (now > 0 && spread > 0) put(zoomed(get(), spread / now));
       spread = now;
     } else if (event.shiftKey || event.buttons & 6) pan((2 * x) / height, (-2 * y) / height);
@@ -35,12 +35,12 @@ export function listen(canvas, scene, get, put, reset) {
   for (const name of ["pointerup", "pointercancel"]) {
     canvas.addEventListener(name, (event) => {
       held.delete(event.pointerId);
-      spread = apart();
+      spread = spacing();
     });
   }
   const alone = canvas.getRootNode() === document && globalThis.top === globalThis.self;
   canvas.addEventListener("wheel", (event) => {
-    if (!alone && !canvas.matches(":focus")) return; // within another page: its scrolling goes on until one clicks here
+    if (!alone && !canvas.matches(":focus")) return; // in an embedding page, scrolling continues until the picture is clicked
     event.preventDefault();
     put(zoomed(get(), Math.exp(Math.max(-0.5, Math.min(0.5, event.deltaY * (event.deltaMode ? 0.05 : 0.0015))))));
   }, { passive: false });
@@ -61,7 +61,7 @@ export function listen(canvas, scene, get, put, reset) {
   });
 }
 
-// A line that is dragged along the picture; `put` gets its share of the width.
+// A line dragged along the picture; `put` receives its share of the width.
 export function listenSplit(handle, stage, get, put) {
   const follow = (event) => {
     const box = stage.getBoundingClientRect();

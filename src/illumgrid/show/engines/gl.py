@@ -1,8 +1,8 @@
 """Pictures by OpenGL without a screen: pyrender on EGL or OSMesa. The only file that imports it.
 
-pyrender 0.1.45 is of 2021 and pins PyOpenGL 3.1.0; what both lack beside a NumPy and a Mesa of today is put right here,
-in `_import`. A process keeps the one platform and the one renderer that it opened first: PyOpenGL chooses its library
-when it is imported, and with EGL the end of one renderer is the end of all.
+pyrender 0.1.45 (2021) pins PyOpenGL 3.1.0; `_import` works around what both lack beside current NumPy and Mesa. A
+process keeps the platform and the renderer that it opened first: PyOpenGL chooses its library on import, and under EGL
+deleting one renderer destroys the context of every other.
 """
 
 import gc
@@ -13,15 +13,16 @@ import warnings
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from illumgrid.field.volume import Floats
 from illumgrid.show.camera import Camera
-from illumgrid.show.meshes import Colored
 from illumgrid.show.shade import Colors
-from illumgrid.tone import decode_srgb, srgb_curve
+from illumgrid.show.triangles import Colored
+from illumgrid.tone import decode_srgb, encode_rgba, srgb_curve
 
 SIDE = 2  # pixels drawn along each side of one: averaged in linear light, as the software engine does
-LARGEST = 16384 // SIDE  # pixels along a side that common drivers can draw
+TILE = 2048  # pixels along a side that are drawn at once: larger framebuffers fail on common drivers
 PACKAGES = {"egl": "libegl1 libgl1", "osmesa": "libosmesa6"}
 """Platforms, best first, and the Debian packages that bring their libraries."""
 
@@ -49,7 +50,7 @@ def _open(platform: str) -> str | None:
     try:
         pyrender = _import(platform)
         renderer = pyrender.OffscreenRenderer(64, 64)
-        renderer._platform.supports_framebuffers = lambda: True  # OSMesa's have the size of the first picture else
+        renderer._platform.supports_framebuffers = lambda: True  # else OSMesa keeps the size of the first picture
         _opened[platform] = pyrender, renderer
     except Exception as error:  # ImportError, AttributeError, EGLError, AssertionError...
         reason = " ".join(f"{type(error).__name__} {error}".split())[:90]
@@ -108,32 +109,61 @@ def _complete_osmesa() -> None:
     OpenGL.platform.GetCurrentContext = current
 
 
-def draw(parts: list[Colored], camera: Camera, width: int, height: int, background: Colors, platform: str) -> Colors:
-    """Display-linear picture (height, width, 3) of triangles; `unavailable(platform)` said None."""
+def draw(
+    parts: list[Colored], camera: Camera, width: int, height: int, background: Colors, platform: str
+) -> NDArray[np.uint8]:
+    """Picture (height, width, 4), sRGB and coverage, of triangles, in tiles; `unavailable(platform)` said None."""
     pyrender, renderer = _opened[platform]
-    scene = pyrender.Scene(bg_color=[*map(float, srgb_curve(background)), 1.0])
+    scene, near, far = _scene(pyrender, parts, camera, background)
+    focal = 0.5 * height / camera.tangent
+    picture = np.empty((height, width, 4), np.uint8)
+    for top in range(0, height, TILE):
+        for left in range(0, width, TILE):
+            tile = picture[top : top + TILE, left : left + TILE]
+            rows, columns = SIDE * tile.shape[0], SIDE * tile.shape[1]
+            renderer.viewport_width, renderer.viewport_height = columns, rows
+            centre = SIDE * (0.5 * width - left), SIDE * (0.5 * height - top)
+            eye = pyrender.IntrinsicsCamera(SIDE * focal, SIDE * focal, *centre, near / far, 1.01)
+            node = scene.add(eye, pose=np.eye(4))
+            flags = pyrender.RenderFlags
+            drawn, _ = renderer.render(scene, flags=flags.FLAT | flags.SKIP_CULL_FACES | flags.RGBA)
+            scene.remove_node(node)
+            tile[:] = encode_rgba(
+                _linear(drawn).reshape(rows // SIDE, SIDE, columns // SIDE, SIDE, 4).mean(axis=(1, 3))
+            )
+    return picture
+
+
+def _scene(pyrender: Any, parts: list[Colored], camera: Camera, background: Colors) -> tuple[Any, float, float]:
+    """What pyrender draws, in the camera's axes and divided by the far distance, and the distances it lies between."""
+    scene = pyrender.Scene(bg_color=[*map(float, srgb_curve(background[:3])), float(background[3])])
     axes = np.stack([camera.right, camera.up, -camera.forward], axis=1)
-    seen = [(part.points - camera.eye) @ axes for part in parts if len(part.faces)]
-    near, far = _depths(seen)
-    for part, points in zip((p for p in parts if len(p.faces)), seen):
+    parts = [part for part in parts if len(part.faces)]
+    placed = [(part.points - camera.eye) @ axes for part in parts]
+    near, far = _depths(placed)
+    for part, points in zip(parts, placed):
         color = np.concatenate([srgb_curve(part.colors), np.ones((len(points), 1), np.float32)], axis=1)
         primitive = pyrender.Primitive(
             positions=(points / far).astype(np.float32), indices=part.faces.astype(np.uint32), color_0=color, mode=4,
             material=pyrender.MetallicRoughnessMaterial(alphaMode="OPAQUE", baseColorFactor=[1.0, 1.0, 1.0, 1.0]),
         )  # fmt: skip
         scene.add(pyrender.Mesh([primitive]))
-    angle = 2 * float(np.arctan(camera.tangent))
-    scene.add(pyrender.PerspectiveCamera(angle, near / far, 1.01, width / height), pose=np.eye(4))
-    renderer.viewport_width, renderer.viewport_height = SIDE * width, SIDE * height
-    flags = pyrender.RenderFlags
-    drawn, _ = renderer.render(scene, flags=flags.FLAT | flags.SKIP_CULL_FACES)
-    linear = decode_srgb(drawn).reshape(height, SIDE, width, SIDE, 3)
-    return np.asarray(linear.mean(axis=(1, 3)), dtype=np.float32)
+    return scene, near, far
 
 
-def _depths(seen: list[Floats]) -> tuple[float, float]:
+def _linear(drawn: NDArray[np.uint8]) -> Colors:
+    """Display-linear colours times coverage (..., 4) of sRGB bytes that the driver multiplied by coverage."""
+    coverage = drawn[..., 3:].astype(np.float32) / 255
+    if (drawn[..., 3] == 255).all():
+        return np.concatenate([decode_srgb(drawn[..., :3]), coverage], axis=-1)
+    whole = np.divide(drawn[..., :3], coverage, out=np.zeros(drawn[..., :3].shape, np.float32), where=coverage > 0)
+    color = decode_srgb(np.clip(np.round(whole), 0, 255).astype(np.uint8))
+    return np.concatenate([color * coverage, coverage], axis=-1)
+
+
+def _depths(placed: list[Floats]) -> tuple[float, float]:
     """Distances of the near and the far plane that hold all points in front of the camera."""
-    depth = np.concatenate([-p[:, 2] for p in seen]) if seen else np.ones(1)
+    depth = np.concatenate([-p[:, 2] for p in placed]) if placed else np.ones(1)
     far = float(depth.max())
     if far <= 0:
         return 0.5, 1.0

@@ -1,14 +1,16 @@
-"""Pictures without any GL: the level sets are marched by the package's own kernels, four rays a pixel."""
+"""Pictures without OpenGL: the level sets are marched by the package's own kernels, four rays per pixel."""
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
+from numpy.typing import NDArray
 
 from illumgrid.field.levelset import upward
 from illumgrid.field.volume import Floats
 from illumgrid.show.camera import Camera
-from illumgrid.show.shade import Colors, Shown
+from illumgrid.show.shade import Colors, Shown, opaque
+from illumgrid.tone import encode_rgba
 
 SIDE = 2  # sub-samples along each side of a pixel
 _ROWS = 24  # picture rows that are traced together: bounds the memory
@@ -22,21 +24,21 @@ def _directions(camera: Camera, width: int, rows: range, height: int) -> Floats:
     return np.asarray(world / np.linalg.norm(world, axis=1, keepdims=True))
 
 
-def traced(seen: Callable[[Floats], Colors], camera: Camera, width: int, height: int) -> Colors:
-    """Display-linear picture (height, width, 3) of the colours that are `seen` along world directions from the eye."""
+def traced(seen: Callable[[Floats], Colors], camera: Camera, width: int, height: int) -> NDArray[np.uint8]:
+    """Picture (height, width, 4), sRGB and coverage, of the colours (n, 4) `seen` along directions from the eye."""
     from illumgrid.backends.numba_ import cores
 
-    def strip(first: int) -> Colors:
+    def strip(first: int) -> NDArray[np.uint8]:
         rows = range(first, min(first + _ROWS, height))
         color = np.clip(seen(_directions(camera, width, rows, height)), 0.0, 1.0)
-        return np.asarray(color.reshape(len(rows), SIDE, width, SIDE, 3).mean(axis=(1, 3)))
+        return encode_rgba(color.reshape(len(rows), SIDE, width, SIDE, 4).mean(axis=(1, 3)))
 
     with ThreadPoolExecutor(cores()) as pool:
         return np.concatenate(list(pool.map(strip, range(0, height, _ROWS))))
 
 
-def draw(shown: Shown, camera: Camera, width: int, height: int, background: Colors) -> Colors:
-    """Display-linear picture (height, width, 3) of one setting of the sweep."""
+def draw(shown: Shown, camera: Camera, width: int, height: int, background: Colors) -> NDArray[np.uint8]:
+    """Picture (height, width, 4), sRGB and coverage, of one setting of the sweep."""
     fields, eye = shown.light.marchable, shown.scene.to_frame(camera.eye)
     axes = shown.scene.fields[0].volume.direction
 
@@ -50,13 +52,13 @@ def draw(shown: Shown, camera: Camera, width: int, height: int, background: Colo
         facing = -np.einsum("ij,ij->i", normal, direction)
         color = np.tile(background, (n, 1))
         for k in range(len(shown.scene.fields)):
-            color[(number == k) & (what == CAP)] = shown.cap(k)
+            color[(number == k) & (what == CAP)] = opaque(shown.cap(k))
             lit = np.flatnonzero((number == k) & (what == SURFACE))
-            color[lit] = shown.field(k, camera.eye + t[lit, None] * directions[lit], facing[lit])
+            color[lit] = opaque(shown.field(k, camera.eye + t[lit, None] * directions[lit], facing[lit]))
         for k in range(len(shown.scene.quads)):
             lit = np.flatnonzero(number == len(shown.scene.fields) + k)
             place = (eye + t[lit, None] * direction[lit] - fields.quad_corner[k]) @ fields.quad_duals[k].T
-            color[lit] = shown.wall(k, place[:, 0], place[:, 1], facing[lit])
+            color[lit] = opaque(shown.wall(k, place[:, 0], place[:, 1], facing[lit]))
         return color
 
     return traced(seen, camera, width, height)

@@ -1,4 +1,4 @@
-"""What a picture shows as coloured triangles, for engines that draw triangles."""
+"""What a picture shows, as coloured triangles for OpenGL."""
 
 from dataclasses import dataclass
 
@@ -15,7 +15,7 @@ WALL_STEPS = 4  # squares along each side of a texel: what is bilinear between t
 
 @dataclass(frozen=True, eq=False)
 class Colored:
-    """Triangles without light of their own.
+    """Triangles and their colours.
 
     Parameters
     ----------
@@ -31,8 +31,8 @@ class Colored:
     colors: Colors
 
 
-def triangles(shown: Shown, eye: Floats) -> list[Colored]:
-    """Surfaces, caps and walls of one setting of the sweep as they are seen from `eye`; walls from their front only."""
+def seen(shown: Shown, eye: Floats) -> list[Colored]:
+    """Surfaces, caps and walls of one setting of the sweep, as seen from `eye`; walls from their front only."""
     found = []
     for number, field in enumerate(shown.scene.fields):
         found += solid(shown, number, field, eye)
@@ -49,11 +49,7 @@ def solid(shown: Shown, number: int, field: Field, eye: Floats) -> list[Colored]
         return []
     points = np.asarray(mesh.vertices)
     index = world_to_index(field.volume, points)
-    # A cap lies in a face of the volume; the mesh comes there to the last bit, but for a trip through the world.
-    cut = np.zeros(len(mesh.faces), dtype=bool)
-    for axis, last in enumerate(np.array(field.volume.shape) - 1):
-        for plane in (0, last):
-            cut |= (index[:, axis] == plane)[mesh.faces].all(axis=1)
+    cut = _caps(index, mesh.faces, field)
     facing = np.zeros(len(points))
     if shown.local or shown.trust:
         toward = eye - points
@@ -65,6 +61,15 @@ def solid(shown: Shown, number: int, field: Field, eye: Floats) -> list[Colored]
         Colored(points, mesh.faces[~cut], shown.field(number, points, facing)),
         Colored(points, mesh.faces[cut], caps),
     ]
+
+
+def _caps(index: Floats, faces: NDArray[np.integer], field: Field) -> NDArray[np.bool_]:
+    """Which faces (m,) lie in a face of the volume: the mesh is exact there."""
+    cut = np.zeros(len(faces), dtype=bool)
+    for axis, last in enumerate(np.array(field.volume.shape) - 1):
+        for plane in (0, last):
+            cut |= (index[:, axis] == plane)[faces].all(axis=1)
+    return cut
 
 
 def squares(nu: int, nv: int) -> NDArray[np.int64]:

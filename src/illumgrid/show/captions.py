@@ -1,0 +1,80 @@
+"""Words on a picture: the isovalues it shows, and a scale bar."""
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from illumgrid.field.scene import Scene
+from illumgrid.field.volume import Floats, Volume
+from illumgrid.show.camera import Camera
+
+Picture = NDArray[np.uint8]
+
+BAR = 0.2  # of the width: a scale bar is the longest round length up to that
+
+
+def isovalues_of(scene: Scene, row: Floats) -> str:
+    """Isovalues (F,) as a line of text; with names where there are several."""
+    if len(row) == 1:
+        return f"{row[0]:.4g}"
+    return ",  ".join(f"{field.name}: {isovalue:.4g}" for field, isovalue in zip(scene.fields, row))
+
+
+def labelled(picture: Picture, text: str) -> Picture:
+    """A picture (height, width, 3 or 4) with a line of text in its lower left corner."""
+    from PIL import Image, ImageDraw
+
+    height, size = picture.shape[0], _text_size(picture)
+    image = Image.fromarray(picture)
+    place = size // 2, height - size // 2
+    ImageDraw.Draw(image).text(place, text, _ink(picture[-size:, : 4 * size]), _font(size), anchor="ls")
+    return np.asarray(image)
+
+
+def scale_bar(picture: Picture, camera: Camera, middle: Floats, volume: Volume) -> Picture:
+    """A picture with a bar of a round length in its lower right corner.
+
+    In perspective a length depends on depth: the bar holds at the depth of the world point `middle` (3,). The unit is
+    that of `volume`; without one the bar has world units.
+    """
+    from PIL import Image, ImageDraw
+
+    height, width = picture.shape[:2]
+    size = _text_size(picture)
+    unit = float((middle - camera.eye) @ camera.forward) * 2 * camera.tangent / height  # world units per pixel
+    length = round_down(BAR * width * unit)
+    name = getattr(volume, "unit", None)
+    image = Image.fromarray(picture)
+    draw, ink = ImageDraw.Draw(image), _ink(picture[-2 * size :, -width // 4 :])
+    right, bottom = width - size, height - size // 2
+    left = right - round(length / unit)
+    draw.rectangle((left, bottom - max(2, size // 6), right, bottom), fill=ink)
+    words = f"{length:g} {name}" if name else f"{length:g}"
+    draw.text(((left + right) / 2, bottom - size // 2), words, ink, _font(size), anchor="ms")
+    return np.asarray(image)
+
+
+def round_down(length: float) -> float:
+    """The largest of 1, 2 or 5 times a power of ten up to `length`."""
+    power = 10.0 ** math.floor(math.log10(length))
+    return max(step * power for step in (1, 2, 5) if step * power <= length * (1 + 1e-9))
+
+
+def _text_size(picture: Picture) -> int:
+    return max(12, int(picture.shape[0]) // 32)
+
+
+def _font(size: int) -> Any:
+    from PIL import ImageFont
+
+    return ImageFont.load_default(size)
+
+
+def _ink(ground: Picture) -> tuple[int, ...]:
+    """Light on a dark ground, dark on a light one, a medium grey where the ground is transparent."""
+    if ground.shape[2] == 4 and ground[..., 3].mean() < 128:
+        return 128, 128, 128, 255
+    tone = 225 if ground[..., :3].mean() < 128 else 40
+    return (tone, tone, tone, 255)[: int(ground.shape[2])]

@@ -1,0 +1,32 @@
+"""What draws: OpenGL where there is one, else the package's own kernels."""
+
+from illumgrid.errors import BadInput
+from illumgrid.show.engines import gl
+
+ENGINES = ("auto", "egl", "osmesa", "software")
+
+
+def choose_engine(name: str) -> tuple[str, str]:
+    """Engine that draws when `name` is asked for, and why.
+
+    Raises
+    ------
+    BadInput
+        If it is unknown, or not available here.
+    """
+    if name not in ENGINES:
+        raise BadInput(f"the engine is {name!r}; expected one of {', '.join(ENGINES)}")
+    if name == "software":
+        return name, "as asked"
+    reasons = []
+    for platform in gl.PACKAGES if name == "auto" else (name,):
+        reason = gl.unavailable(platform)
+        if reason is None:
+            return platform, "as asked" if name == platform else f"OpenGL is available through {platform.upper()}"
+        reasons.append(f"no {platform.upper()} ({reason})")
+    if name == "auto":
+        return "software", f"{' and '.join(reasons)}; apt-get install {' '.join(gl.PACKAGES.values())} brings OpenGL"
+    raise BadInput(
+        f"the engine {name} was asked for, but there is {reasons[0]}; install it (apt-get install {gl.PACKAGES[name]} "
+        "on Debian and Ubuntu) or choose --engine software"
+    )

@@ -1,0 +1,104 @@
+"""The arrays of a page as one run of bytes: field values in whole steps, light in half floats."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from illumgrid.field.volume import Volume, index_to_world
+from illumgrid.grid import GridSpec, IlluminationGrid, read_lattice
+
+HOLE = -1.0  # in place of an error: no light of its own, or no error known
+_STEPS = 65535
+_FINE = 4096  # steps that the swept range must span: else values far outside it are clamped
+
+
+class Bytes:
+    """Arrays, one after the other."""
+
+    def __init__(self) -> None:
+        self.parts: list[bytes] = []
+        self.length = 0
+
+    def add(self, part: bytes) -> int:
+        """Append, and return where it begins."""
+        self.parts.append(part)
+        self.length += len(part)
+        return self.length - len(part)
+
+
+def _factor(shape: tuple[int, ...], most: int) -> int:
+    """The smallest factor by which all axes must shrink to leave at most `most` points."""
+    factor = 1
+    while np.prod([-(-n // factor) for n in shape]) > most:
+        factor += 1
+    return factor
+
+
+def reduced(volume: Volume, most: int) -> Volume:
+    """Means over blocks of voxels, the same number along each axis, until at most `most` remain."""
+    factor = _factor(volume.shape, most)
+    if factor == 1:
+        return volume
+    padded = np.pad(volume.values, [(0, -n % factor) for n in volume.shape], mode="edge")
+    split = padded.reshape([k for n in padded.shape for k in (n // factor, factor)])
+    origin = index_to_world(volume, np.full((1, 3), (factor - 1) / 2))[0]
+    return Volume(split.mean(axis=(1, 3, 5)), origin, volume.spacing * factor, volume.direction)
+
+
+def thinned(grid: IlluminationGrid, most: int) -> IlluminationGrid:
+    """Light on fewer nodes, at most about `most`, from the first node to the last: what the grid answers there.
+
+    Error and support are those of the nearest node.
+    """
+    factor = _factor(grid.spec.shape, most)
+    if factor == 1:
+        return grid
+    old = np.array(grid.spec.shape) - 1
+    new = np.maximum(1, -(-old // factor))
+    shape = (int(new[0]) + 1, int(new[1]) + 1, int(new[2]) + 1)
+    spec = GridSpec(shape, grid.spec.origin, grid.spec.spacing * old / new, grid.spec.direction)
+    points = index_to_world(spec, np.indices(shape).reshape(3, -1).T)
+    light = read_lattice(grid.spec, grid.light, points).reshape(*shape, -1)
+    nearest = np.ix_(*(np.round(np.linspace(0, last, n)).astype(int) for last, n in zip(old, shape)))
+    return IlluminationGrid(spec, light, grid.error[nearest], grid.support[nearest], grid.channels)
+
+
+def field_steps(values: NDArray[np.float32], limits: tuple[float, float]) -> tuple[NDArray[Any], float, float, bool]:
+    """Values as whole steps of 8 or 16 bits: (steps, base, step, whether any was clamped); value = base + step · steps.
+
+    Whole numbers that fit stay exact. Others get 65535 steps over all values, or, where that would leave too few for
+    the swept `limits`, over those and eight times their span on either side.
+    """
+    low, high = float(values.min()), float(values.max())
+    if high - low <= _STEPS and max(abs(low), abs(high)) < 2**24 and (values == np.round(values)).all():
+        return (values - low).astype(np.uint8 if high - low < 256 else np.uint16), low, 1.0, False
+    clamped = (limits[1] - limits[0]) * _STEPS < _FINE * (high - low)
+    if clamped:
+        span = limits[1] - limits[0]
+        low, high = max(low, limits[0] - 8 * span), min(high, limits[1] + 8 * span)
+    step = (high - low) / _STEPS or 1.0
+    steps = np.clip(np.round((values.astype(float) - low) / step), 0, _STEPS).astype(np.uint16)
+    return steps, low, step, clamped
+
+
+def _planes(words: NDArray[np.uint16]) -> bytes:
+    """All low bytes, then all high bytes: similar bytes lie together and compress better."""
+    return (words & 0xFF).astype(np.uint8).tobytes() + (words >> 8).astype(np.uint8).tobytes()
+
+
+def pack_values(steps: NDArray[Any], into: Bytes) -> dict[str, Any]:
+    """Field values (nx, ny, nz) as differences along x."""
+    x_fastest = np.ascontiguousarray(steps.transpose(2, 1, 0))
+    x_fastest[:, :, 1:] -= x_fastest[:, :, :-1].copy()  # wraps around; adding up undoes it
+    data = x_fastest.tobytes() if steps.dtype == np.uint8 else _planes(x_fastest.ravel())
+    return {"shape": list(steps.shape), "bytes": steps.dtype.itemsize, "offset": into.add(data)}
+
+
+def pack_light(light: NDArray[np.floating], error: NDArray[np.floating], into: Bytes) -> dict[str, Any]:
+    """Light (nx, ny, nz, C), grey or RGB, and its error (nx, ny, nz) as half floats, x fastest."""
+    texels = np.concatenate([light, error[..., None]], axis=3).transpose(3, 2, 1, 0)
+    half = np.clip(texels, -65504, 65504).astype(np.float16).view(np.uint16).reshape(len(texels), -1)
+    half[1:-1] -= half[0]  # channels are similar: the differences compress well
+    data = b"".join(_planes(channel) for channel in half)
+    return {"shape": list(light.shape[:3]), "channels": light.shape[3], "offset": into.add(data)}
