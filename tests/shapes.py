@@ -1,5 +1,7 @@
 """Small fields whose surfaces are known, lights made by hand, and what the tests of refusals share."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -63,3 +65,10 @@ def lit(scene, value=1.0, nodes=4):
         for q in scene.quads
     ]
     return Illumination(scene, level_table(scene, 2), tuple(grids), tuple(walls), {"seed": 0})
+
+
+def relit(light, number=0, **parts):
+    """The same illumination with other values, error or support in one of its grids."""
+    grids = list(light.grids)
+    grids[number] = replace(grids[number], **parts)
+    return replace(light, grids=tuple(grids))

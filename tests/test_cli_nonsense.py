@@ -98,7 +98,7 @@ REFUSED = {
     ("preview", "--cut"): [*FLAG, ""],
     ("preview", "--view"): [*NAMES, "30", "nan,0", "0,91", "1,2,3"],
     ("preview", "--zoom"): [*NUMBERS, "-1", "0", "1e-320", "1e308"],
-    ("preview", "--size"): [f"{n}|8" for n in (*WORDS, "-1", "0", HUGE)] + [f"8|{n}" for n in ("0", "8193")],
+    ("preview", "--size"): [f"{n}|8" for n in (*WORDS, "-1", "0", HUGE)] + [f"8|{n}" for n in ("0", "16385")],
     ("preview", "--background"): [*NAMES, "#12", "rgb(1,2)"],
     ("preview", "--engine"): NAMES,
     ("view", "folder"): RUNS,

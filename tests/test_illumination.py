@@ -11,7 +11,7 @@ from PIL import Image
 
 import illumgrid as ig
 from illumgrid import show as preview
-from illumgrid.tone import encode_srgb
+from illumgrid.tone import curve, encode_srgb
 from shapes import ball, lit, refused, sky
 
 QUICK = {"grid": 8, "paths": 4, "bounces": 1}
@@ -105,7 +105,7 @@ def test_a_colour_is_albedo_over_pi_times_light_times_exposure_in_srgb(light):
     for exposure in (None, 0.5, 3.0):
         used = light.exposure if exposure is None else exposure
         color = light.color(points, "field", exposure)
-        assert color.dtype == np.uint8 and np.array_equal(color, encode_srgb(radiance * used))
+        assert color.dtype == np.uint8 and np.array_equal(color, encode_srgb(curve(radiance * used)))
     assert np.array_equal(light.color(points), light.color(points, "field"))
     refused(lambda: light.color(points, "nobody"), "'nobody'")
 

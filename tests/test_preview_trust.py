@@ -7,7 +7,7 @@ from PIL import Image
 from illumgrid.show import render, trust
 from illumgrid.show.trust import HIGH, LOW, SMALLEST, doubts, scale, scale_colors
 from illumgrid.tone import decode_srgb, encode_srgb
-from shapes import DIRECTIONS, ball, lit, refused, sky
+from shapes import DIRECTIONS, ball, lit, refused, relit, sky
 from test_tone_preview import three_balls
 
 SIZE = {"width": SMALLEST[0], "height": SMALLEST[1]}
@@ -60,9 +60,7 @@ def test_a_surface_has_the_color_of_its_bar_on_the_scale_that_is_drawn(bar):
 def test_bars_are_relative_to_the_light_of_their_own_field():
     light = barred(0.03, three_balls())
     for number, grid in enumerate(light.grids):
-        factor = np.float32(10.0**number)
-        grid.values[:] *= factor
-        grid.error[:] *= factor
+        light = relit(light, number, values=grid.values * 10.0**number, error=grid.error * 10.0**number)
     for number, grid in enumerate(light.grids):
         point = light.scene.fields[number].volume.origin + 0.5
         found = trust.trust_colors(grid, point[None], np.ones(1))
@@ -108,7 +106,7 @@ def test_what_bars_cannot_tell_is_said_with_the_field():
     light = barred(0.05, nodes=12)
     assert doubts(light) == []
     light = barred(0.05, nodes=12)
-    light.grids[0].values[:] += np.random.default_rng(0).normal(size=(12, 12, 12, 1)).astype(np.float32)
+    light = relit(light, values=light.grids[0].values + np.random.default_rng(0).normal(size=(12, 12, 12, 1)))
     assert doubts(light) == ["lower bounds only: the grid does not resolve the light of field"]
     light = barred(np.inf)
     assert len(doubts(light)) == 1 and "too few paths" in doubts(light)[0] and "field" in doubts(light)[0]

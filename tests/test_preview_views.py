@@ -9,7 +9,7 @@ from illumgrid.field.scene import Field, Material, Scene
 from illumgrid.show import VIEWS, fit_camera, grid_volume, render, widest_row
 from illumgrid.show.block import FACES, HOLE
 from illumgrid.tone import decode_srgb, encode_srgb
-from shapes import DIRECTIONS, ball, lit, refused, sky
+from shapes import DIRECTIONS, ball, lit, refused, relit, sky
 from test_tone_preview import GROUND, SIZE, is_object, places, three_balls
 
 AXES = {"front": (0, -1, 0), "back": (0, 1, 0), "right": (1, 0, 0), "left": (-1, 0, 0), "top": (0, 0, 1),
@@ -91,7 +91,9 @@ def test_the_camera_of_a_sweep_holds_the_solids_of_all_its_settings():
 
 def test_a_block_shows_the_light_of_its_nodes_in_its_faces():
     light = lit(sky(), nodes=9)
-    light.grids[0].values[:, 0] *= 0.5  # what is in front
+    values = light.grids[0].values.copy()
+    values[:, 0] *= 0.5  # what is in front
+    light = relit(light, values=values)
     light.__dict__["exposure"] = 1.0
     picture = decode_srgb(grid_volume(light, view="front", **SIZE))
     expected = 0.8 / np.pi * 0.5 * FACES[1]
@@ -115,9 +117,9 @@ def test_the_corner_towards_the_eye_is_cut_out_and_shows_the_middle(direction):
     volume = ball(16)
     volume = type(volume)(volume.values, (3, 4, 5), volume.spacing, direction)
     light = lit(sky(volume), nodes=9)
-    values = light.grids[0].values
-    values[:] = 0.2
+    values = np.full((9, 9, 9, 3), 0.2)
     values[1:-1, 1:-1, 1:-1] = 1.0
+    light = relit(light, values=values)
     light.__dict__["exposure"] = np.pi / 0.8
     whole, cut = (grid_volume(light, view="iso", cut=cut, **SIZE).astype(int) for cut in (False, True))
     assert np.array_equal(is_object(whole), is_object(cut))  # along a diagonal the corner hides nothing outside

@@ -10,7 +10,7 @@ from illumgrid.field.scene import Field, Material, Scene
 from illumgrid.field.volume import Volume
 from illumgrid.show import BACKGROUND, CAP_TONE, fit_camera, png, render
 from illumgrid.tone import WHITE, automatic_exposure, curve, encode_srgb
-from shapes import lit, sampled, sky
+from shapes import lit, relit, sampled, sky
 
 GROUND = encode_srgb(np.full(3, BACKGROUND))
 SIZE = {"width": 120, "height": 90}
@@ -224,11 +224,11 @@ def test_a_surface_is_shown_at_albedo_over_pi_times_its_light_times_the_exposure
 
 def test_the_light_on_show_is_that_of_the_field_and_the_place():
     light = lit(sky(), nodes=9)
-    values = light.grids[0].values
+    values = light.grids[0].values.copy()
     values[..., 1:] = 0
     values[4:, :, :, 0] = 0  # the half at -x is red
     values[4:, :, :, 1] = 1  # the half at +x is green
-    picture = render(light, **SIZE).astype(int)
+    picture = render(relit(light, values=values), **SIZE).astype(int)
     left = np.flatnonzero(is_object(picture)[45])[1]
     # seen from 30 degrees to the right: +x is in the middle too
     assert picture[45, left, 0] > 100 > picture[45, left, 1]
