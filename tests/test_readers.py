@@ -36,6 +36,7 @@ FORMATS = [
 ]
 
 
+@pytest.mark.filterwarnings("ignore:spacing")  # a TIFF does not say how far its slices are
 @pytest.mark.parametrize(("ending", "dtype"), FORMATS)
 @pytest.mark.parametrize("how", ["plain", "compressed", "gz"])
 def test_round_trip(tmp_path, ending, dtype, how):
@@ -162,6 +163,7 @@ def test_mrc_of_the_other_byte_order_and_with_turned_axes(tmp_path):
     refused(file, "promises")
 
 
+@pytest.mark.filterwarnings("ignore:spacing")
 @pytest.mark.parametrize("options", [{}, {"bigtiff": True}, {"byteorder": ">"}, {"compression": "zlib"}])
 def test_tiff_by_another_writer(tmp_path, options):
     file = tmp_path / "a.tif"

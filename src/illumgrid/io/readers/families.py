@@ -30,7 +30,7 @@ FAMILIES = (
     # DICOM first: its preamble may look like a TIFF.
     Family("DICOM", "dicom", (".dcm", ".ima"), ((128, b"DICM"),), ("channel", "time", "array"), True),
     Family(
-        *("TIFF", "itk", (".tif", ".tiff", ".lsm", ".btf")),
+        *("TIFF", "tiff", (".tif", ".tiff", ".lsm", ".btf")),
         starts=((0, b"II*\0"), (0, b"MM\0*"), (0, b"II+\0"), (0, b"MM\0+")),
         chooses=("channel", "time", "array"),
     ),

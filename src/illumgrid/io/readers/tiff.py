@@ -1,0 +1,219 @@
+"""TIFF stacks by tifffile: series, channels, time steps, many slices in one directory, folders of single slices."""
+
+import logging
+import math
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from illumgrid.errors import BadInput
+from illumgrid.io.readers.limits import check_axes, check_memory, check_size
+from illumgrid.io.readers.source import AGAIN, Source, find_source, seekable
+from illumgrid.io.readers.stored import Note, Stored, Wanted, pick
+from illumgrid.io.readers.tiff_spacing import calibrated, channel_names
+
+CODECS = {1, 5, 7, 8, 32773, 32946, 33003, 33005, 34712, 34925, 50000}
+"""None, LZW, JPEG, deflate, packbits, deflate by its old number, JPEG 2000 by three numbers, LZMA, zstd."""
+
+BOUNDED = {1: 1, 5: 4096, 8: 1032, 32773: 128, 32946: 1032}
+"""Times its size that data of these codecs unpack to at most."""
+
+
+def read(source: Source, wanted: Wanted) -> Stored:
+    """Read one volume of a TIFF: series (array), channel and time step are chosen by the user."""
+    with _opened_tiff(source) as (tiff, reports):
+        number = _series(tiff, wanted)
+        _refuse_damaged(reports)
+        series, names = tiff.series[number], channel_names(tiff, number)
+        check_pages(tiff, series)
+        values, notes = _three_axes(real(series.asarray()), series.axes, wanted, names)
+        spacing, unit, more = calibrated(tiff, number)
+        notes = (*notes, *more, *_serious(reports))
+    return Stored(values, np.zeros(3), np.diag(spacing), unit=unit, notes=notes)
+
+
+def read_folder(files: Sequence[Path], wanted: Wanted) -> Stored:
+    """Stack single TIFF slices, in the order of the numbers in their names."""
+    ordered = sorted(files, key=lambda f: [(int(w), "") if w.isdecimal() else (-1, w) for w in _parts(f.name)])
+    slices: list[NDArray[Any]] = []
+    for file in ordered:
+        source = find_source(file)
+        try:
+            with _opened_tiff(source) as (tiff, reports):
+                series = tiff.series[0]
+                _refuse_damaged(reports)
+                if len(tiff.series) > 1 or series.ndim != 2:
+                    raise BadInput("is no single grey slice; expected only those; give it alone if it is a stack")
+                if not slices:
+                    spacing, unit, notes = calibrated(tiff, 0)
+                    check_memory(len(ordered) * series.nbytes)
+                elif (series.shape, series.dtype) != (slices[0].shape, slices[0].dtype):
+                    raise BadInput(
+                        "differs in size or type from the first slice; expected equal slices; move it elsewhere"
+                    )
+                check_pages(tiff, series)
+                slices.append(real(series.asarray()))
+        except BadInput as problem:
+            raise BadInput(f"its slice {file.name} {problem}") from None
+    if len(slices) < 2:
+        raise BadInput("holds one TIFF slice; expected at least 2; give the folder of the whole stack")
+    return Stored(np.stack(slices).T, np.zeros(3), np.diag(spacing), unit=unit, notes=(*notes, *_gaps(ordered)))
+
+
+def _parts(name: str) -> list[str]:
+    return re.split(r"(\d+)", name.lower())
+
+
+def _gaps(files: Sequence[Path]) -> tuple[Note, ...]:
+    """What the last numbers in the names say of missing slices."""
+    numbers = [int(found[-1]) for file in files if (found := re.findall(r"\d+", file.stem))]
+    if len(numbers) != len(files) or len(set(numbers)) < len(numbers):
+        return ()
+    steps = np.diff(numbers)
+    if not len(steps) or (steps == steps[0]).all() or (steps <= 0).any():
+        return ()
+    at = int(np.argmax(steps))
+    said = (
+        f"slices are missing between {files[at].name} and {files[at + 1].name}; they are stacked as if there were none"
+    )
+    return (("file", said),)
+
+
+class _Ear(logging.Handler):
+    """Keeps what tifffile reports."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.reports: list[str] = []
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.reports.append(record.getMessage())
+
+
+@contextmanager
+def _opened_tiff(source: Source) -> Iterator[tuple[Any, list[str]]]:
+    """The file by tifffile, alone (an OME file may name others), and what tifffile reports, in place of stderr."""
+    import tifffile
+
+    ear, log = _Ear(), logging.getLogger("tifffile")
+    propagated = log.propagate
+    log.propagate = False
+    log.addHandler(ear)
+    try:
+        # tifffile reads on where pages or tags are lost, and reports it.
+        with seekable(source) as stream, tifffile.TiffFile(stream, name=source.name, _multifile=False) as tiff:
+            yield tiff, ear.reports
+    except tifffile.TiffFileError as problem:
+        raise BadInput(f"is not a whole TIFF ({_plain(str(problem))}); {AGAIN}") from None
+    finally:
+        log.removeHandler(ear)
+        log.propagate = propagated
+
+
+def _plain(text: str) -> str:
+    text = re.sub(r"<[^<>]*> *|@ ?\d+", "", text)
+    return " ".join("".join(c if c.isprintable() else " " for c in text).split())[:150]
+
+
+def _refuse_damaged(reports: list[str]) -> None:
+    for text in reports:
+        if "circular" in text:
+            raise BadInput(f"the pages of this TIFF run in a circle; {AGAIN}")
+        if re.search("invalid page offset|invalid value offset|corrupt", text):
+            raise BadInput(f"the TIFF ends before its last page, or is damaged ({_plain(text)}); {AGAIN}")
+
+
+def _serious(reports: list[str]) -> tuple[Note, ...]:
+    """What of tifffile's reports a user should know."""
+    serious = [text for text in reports if re.search(r"corrupt|invalid|missing|truncated|fail|raised", text)]
+    return (("file", f"tifffile reports: {_plain(serious[0])}"),) if serious else ()
+
+
+def _series(tiff: Any, wanted: Wanted) -> int:
+    """Number of the series that is the volume; thumbnails and the coarse levels of a pyramid do not count."""
+    if not tiff.series:
+        raise BadInput("a TIFF without images; expected slices; look how it was written")
+    full = [n for n, s in enumerate(tiff.series) if not s.keyframe.is_reduced] or list(range(len(tiff.series)))
+    whole = [tiff.series[n] for n in full]
+    if tiff.is_imagej and whole[0].kind != "imagej":
+        images = (tiff.imagej_metadata or {}).get("images", 0)
+        if images > len(tiff.pages):
+            raise BadInput(f"ends too early: ImageJ's description promises {images} images; {AGAIN}")
+    names = [f"{s.name} {'x'.join(map(str, s.shape[::-1]))}" for s in whole]
+    if len(whole) > 1 and wanted.array is None and {s.kind for s in whole} <= {"generic", "uniform"}:
+        listed = ", ".join(f"{n} {name}" for n, name in enumerate(names[:8]))
+        raise BadInput(f"its pages differ in size or form: {listed}; expected equal slices; choose some with --array N")
+    return full[pick(wanted.array, "array", names)]
+
+
+def check_pages(tiff: Any, series: Any) -> None:
+    """Refuse codecs that no volume needs, and pages of which a part is not there or leaves the file."""
+    pages = list(series.pages)
+    if any(page is None for page in pages):
+        lost = sum(page is None for page in pages)
+        raise BadInput(f"{lost} of its {len(pages)} planes are in other files; expected one file; save it as one")
+    first = series.keyframe
+    if first.compression not in CODECS:
+        raise BadInput(
+            f"packed by {first.compression!r}; expected none, LZW, deflate, zstd or JPEG; save it as one of those"
+        )
+    held, size, form = 0, tiff.filehandle.size, tiff.tiff
+    for page in pages:
+        tiff.filehandle.seek(page.offset)
+        tags = int.from_bytes(tiff.filehandle.read(form.tagnosize), "little" if form.byteorder == "<" else "big")
+        if page.offset + form.tagnosize + tags * form.tagsize + form.offsetsize > size:
+            raise BadInput(f"the TIFF ends before its last page; {AGAIN}")
+        if len(page.dataoffsets) != len(page.databytecounts) or len(page.dataoffsets) < math.prod(first.chunked) > 1:
+            raise BadInput(f"a page of it lacks some of its strips or tiles; {AGAIN}")
+        for at, count in zip(page.dataoffsets, page.databytecounts):
+            if count <= 0 or at + count > size:
+                raise BadInput(f"the TIFF ends before its last page; {AGAIN}")
+            held += count
+    if series.dataoffset is not None and len(pages) == 1:
+        held = size - series.dataoffset  # one directory for all slices
+    most = held * BOUNDED.get(int(first.compression), 1 << 40)
+    check_size(series.nbytes, most, series.nbytes)
+
+
+def real(values: NDArray[Any]) -> NDArray[Any]:
+    """The same if they are real numbers."""
+    if values.dtype.kind not in "biuf":
+        raise BadInput(f"each voxel is of the type {values.dtype}; expected one real number; save the magnitude")
+    return values
+
+
+def _three_axes(
+    values: NDArray[Any], axes: str, wanted: Wanted, names: Sequence[str]
+) -> tuple[NDArray[Any], tuple[Note, ...]]:
+    """The volume (x, y, z) of an array with these axes, by tifffile's letters, and what was assumed."""
+    notes: tuple[Note, ...] = ()
+    if "Z" not in axes:
+        # Pages without a meaning, or else what their writer called time steps, are slices.
+        stack = next((axis for axis in "IQRT" if axis in axes), "")
+        if stack == "T" and wanted.time is None:
+            notes = (("file", "its slices are called time steps; they were taken for slices along z"),)
+        if stack and not (stack == "T" and wanted.time is not None):
+            axes = axes.replace(stack, "Z", 1)
+    if "S" in axes and "C" not in axes:
+        axes = axes.replace("S", "C")
+        names = ("red", "green", "blue", "alpha")[: values.shape[axes.index("C")]]
+    for option, letter in (("time", "T"), ("channel", "C")):
+        given = getattr(wanted, option)
+        count = values.shape[axes.index(letter)] if letter in axes else 1
+        known = list(names) if letter == "C" and len(names) == count else [""] * count
+        number = pick(given, option, known)
+        if letter in axes:
+            values, axes = np.take(values, number, axes.index(letter)), axes.replace(letter, "", 1)
+    for axis in [a for a in axes if a not in "XYZ" and values.shape[axes.index(a)] == 1]:
+        values, axes = np.take(values, 0, axes.index(axis)), axes.replace(axis, "", 1)
+    if sorted(axes) != ["X", "Y", "Z"]:
+        check_axes(values.shape[::-1])
+        raise BadInput(
+            f"its axes are {axes}; expected slices along z, and perhaps channels and time steps; save only those"
+        )
+    return values.transpose([axes.index(axis) for axis in "XYZ"]), notes
