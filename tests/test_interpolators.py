@@ -294,6 +294,17 @@ def test_slabs_of_nodes_do_not_show(stage, monkeypatch):
         assert np.array_equal(getattr(whole, name), getattr(parts, name))
 
 
+@pytest.mark.parametrize("stage", [Nearest(), Splat(), Rbf()], ids=["nearest", "splat", "rbf"])
+def test_one_channel_has_the_bits_of_three(stage):
+    random = np.random.default_rng(3)
+    samples = answers(cloud(700, SPEC), random.random(700), stderr=0.3, level=random.integers(0, 4, 700))
+    grey = Samples(samples.queries, samples.mean[:, :1], samples.m2[:, :1], samples.paths)
+    one, three = (stage.fill(asked, Nodes(SPEC, FIELD)) for asked in (grey, samples))
+    assert one.light.shape == (9, 9, 9, 1) and three.light.shape == (9, 9, 9, 3)
+    for name in ("values", "error", "support", "bar"):
+        assert np.array_equal(getattr(one, name), getattr(three, name)), name
+
+
 @BOTH
 @pytest.mark.parametrize("scale", [2.0**-20, 2.0**20])
 def test_the_unit_of_length_does_not_matter(stage, scale):

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from illumgrid.errors import BadInput
 from illumgrid.field.scene import Levels, Quad, Scene
 from illumgrid.field.volume import interpolate, world_to_index
-from illumgrid.grid import GridSpec, IlluminationGrid, Nodes, WallTexture, fill_holes
+from illumgrid.grid import GridSpec, IlluminationGrid, Nodes, WallTexture, channels_of, fill_holes
 from illumgrid.grid.channels import Channels
 from illumgrid.samplers.direct import Direct, reachable
 from illumgrid.stages import Backend, Interpolator, Sampler
@@ -350,5 +350,6 @@ def _of_field(scene: Scene, answers: Sequence[Samples], number: int) -> Samples:
     own = [a if (a.queries.target == number).all() else a[a.queries.target == number] for a in answers]
     if own := [a for a in own if len(a)]:
         return join_samples(own)
-    rgb = np.zeros((0, 3), np.float32)
-    return Samples(Queries.at(scene, np.zeros((0, 3))), rgb, rgb, np.zeros(0, np.int32))
+    channels = channels_of(scene)
+    none = np.zeros((0, len(channels)), np.float32)
+    return Samples(Queries.at(scene, np.zeros((0, 3))), none, none, np.zeros(0, np.int32), channels)

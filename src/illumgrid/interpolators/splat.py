@@ -32,7 +32,10 @@ def _kernel_means(places: Sites, around: Neighbours) -> tuple[Floats, Floats]:
         kernel = np.where(there, (1 - q) ** 4 * (4 * q + 1) * places.paths[around.site], 0.0)
         sums = kernel.sum(axis=1)
         weight += kernel * np.divide(share[:, number], sums, out=np.zeros_like(sums), where=sums > 0)[:, None]
-    return weight, np.einsum("mk,mki->mi", weight, places.mean[around.site])
+    value = np.zeros((len(weight), places.mean.shape[1]))
+    for w, site in zip(weight.T, around.site.T):  # in this order for any number of channels, unlike einsum
+        value += w[:, None] * places.mean[site]
+    return weight, value
 
 
 @dataclass(frozen=True)
