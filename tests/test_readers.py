@@ -153,7 +153,7 @@ def test_mrc_of_the_other_byte_order_and_with_turned_axes(tmp_path):
     turned = bytearray(data)
     turned[64:76] = struct.pack("<3i", 3, 2, 1)
     file.write_bytes(turned)
-    refused(file, "(3, 2, 1)")
+    assert np.array_equal(read_volume(file).values, values().T)
     words = np.frombuffer(data, "<u4").byteswap()
     swapped = bytearray(words.tobytes())
     swapped[208:212], swapped[212:216] = b"MAP ", bytes([17, 17, 0, 0])

@@ -48,7 +48,7 @@ FAMILIES = (
         medical=True,
     ),
     Family(
-        *("MRC", "itk", (".mrc", ".mrcs", ".rec", ".map", ".ccp4", ".st", ".ali")),
+        *("MRC", "mrc", (".mrc", ".mrcs", ".rec", ".map", ".ccp4", ".st", ".ali")),
         starts=((208, b"MAP "), (208, b"MAP\0")),
         chooses=("array",),
     ),
