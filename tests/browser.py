@@ -1,4 +1,4 @@
-"""A real browser without a screen, and small lit scenes for it: what the tests of the page share."""
+"""A headless browser, and small lit scenes for it, shared by the tests of the page."""
 
 import base64
 import io
@@ -30,14 +30,14 @@ SMALL = (
 
 
 def waves(*shape):
-    """Smooth colours (*shape, 3), different everywhere and along every axis, from 0.4 to 2.4."""
+    """Smooth colours (*shape, 3) from 0.4 to 2.4 that vary along every axis."""
     place = np.stack(np.meshgrid(*(np.linspace(0, 1, n) for n in shape), indexing="ij"), axis=-1)
     slopes = np.array([[4.0, 1.1, -1.7], [-1.3, 3.1, 2.3], [2.1, -2.9, 3.7]])
     return (1.4 + np.sin(place @ slopes + (0.3, 1.0, 2.0))).astype(np.float32)
 
 
 def coloured(scene, nodes=9, rows=3):
-    """Light that differs everywhere, without a run; a sheet of nodes in the first grid are holes."""
+    """Light that varies everywhere, made without a run; one sheet of nodes in the first grid consists of holes."""
     grids, walls = [], []
     for field in scene.fields:
         spec = GridSpec.over(field.volume, nodes)
@@ -51,7 +51,7 @@ def coloured(scene, nodes=9, rows=3):
 
 
 def bent(n=(22, 17, 25)):
-    """Mirrored, oblique, uneven, far from the origin; solid below; the solid is cut by the border."""
+    """A mirrored, oblique, anisotropic lattice far from the origin; solid below; the border cuts the solid."""
     place = {"origin": (900.0, -50.0, 3000.0), "spacing": (0.9, 1.4, 0.8), "direction": MIRRORED}
     centre = sampled(lambda x: x[:, 0], n, **place)
     axes = centre.direction * centre.spacing
@@ -70,7 +70,7 @@ def bent(n=(22, 17, 25)):
 
 
 def pair():
-    """Two fields in a room, of whole numbers and of broken ones."""
+    """Two fields in a room, one of integers and one of floats."""
     one, other = ball(18, at=(-0.3, 0, 0.1)), ball(15, at=(0.4, -0.2, -0.3))
     whole = one.with_values(np.round(3000 * one.values))
     fields = (
@@ -81,7 +81,7 @@ def pair():
 
 
 def camera_state(scene, camera):
-    """A still picture's camera, as the page's address has it."""
+    """The camera of a still picture, in the form of the page's address."""
     right, front, up = upright(scene.fields[0].volume.direction)
     ahead = camera.forward
     target = Stage.of(scene).place(camera.eye) + ahead
@@ -97,7 +97,7 @@ TO = """(address) => new Promise((done) => {
 
 
 class Browser:
-    """One browser for a module of tests; what it asked for and complained about is kept."""
+    """One browser per test module; it records requests and errors."""
 
     def __init__(self, playwright, folder):
         self.chromium = playwright.chromium.launch(executable_path=CHROMIUM, args=ARGS)
@@ -111,7 +111,7 @@ class Browser:
         self.page.on("console", lambda said: self.troubles.append(said.text) if said.type == "error" else None)
 
     def open(self, light, address="", anew=False):
-        """Show a light at an address: a page that shows it already only gets the address."""
+        """Show a light at an address; a page that shows this light already only gets the address."""
         if self.shown is light and not anew:
             self.page.evaluate(TO, address)
             return self.settle()
@@ -138,7 +138,7 @@ def decoded(file):
 
 
 def still(light, t, local=False):
-    """The software picture at a share of the sweep, the page's address for the same, and where the object is."""
+    """The software picture at a position of the sweep, the page's address for the same view, and the object's mask."""
     scene = light.scene
     row = scene.levels(t)[0]
     camera = fit_camera(scene, row, WIDTH / HEIGHT)

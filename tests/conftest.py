@@ -1,4 +1,4 @@
-"""The command line as a function: what all tests of it share."""
+"""The command line as a function, shared by all its tests."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from shapes import ball
 
 @pytest.fixture
 def call(capsys, tmp_path, monkeypatch):
-    """Run a command in a folder of its own, with small pictures; returns what it said."""
+    """Run a command in its own folder, with small pictures; returns its output."""
     monkeypatch.setattr(preview.render, "__kwdefaults__", {**preview.render.__kwdefaults__, "width": 64, "height": 48})
     monkeypatch.chdir(tmp_path)
     np.save(tmp_path / "v.npy", ball(10).values)
@@ -27,7 +27,7 @@ def call(capsys, tmp_path, monkeypatch):
 
 @pytest.fixture
 def refuse(call, tmp_path):
-    """A command is refused in one sentence with these words, and nothing is written."""
+    """A command is refused in one sentence that contains these words, and writes nothing."""
 
     def refuse(*args, words):
         before = sorted(tmp_path.rglob("*"))

@@ -1,4 +1,4 @@
-"""Mutated files against everything that reads files: BadInput or a right result, and nothing else.
+"""Mutated files against every reader: the outcome must be BadInput or a correct result.
 
 ``python tests/fuzz.py --seconds 1800`` works for half an hour; `test_fuzz.py` for a moment, over the corpus first. What
 is found is kept in `tests/corpus` and is from then on a test.
@@ -38,7 +38,7 @@ ROOM = 1 << 30
 
 @dataclass(frozen=True)
 class Target:
-    """What is fuzzed: a file of a few kilobytes among others in a folder, and who reads it."""
+    """A fuzzing target: a file of a few kilobytes among others in a folder, and the function that reads it."""
 
     name: str
     make: Callable[[Path], Path]
@@ -97,7 +97,7 @@ def _run(part: str, sealed: bool) -> Target:
         return folder / "out" / part
 
     def read(file: Path) -> object:
-        if sealed:  # as somebody would who forges a run
+        if sealed:  # as when forging a run
             try:
                 reseal(file.parent)
             except (ValueError, TypeError, RecursionError, OSError):
@@ -117,7 +117,7 @@ TARGETS = (
 
 
 def mutate(data: bytes, chance: random.Random) -> bytes:
-    """Flip, cut, repeat, insert, or put a number that lies: mostly near the head, where sizes stand."""
+    """Flip, cut, repeat or insert bytes, or write a false number, mostly near the head, which holds the sizes."""
     result = bytearray(data)
     for _ in range(chance.choice((1, 1, 1, 2, 4, 16))):
         if not result:
@@ -149,7 +149,7 @@ def mutate(data: bytes, chance: random.Random) -> bytes:
 
 
 def judge(target: Target, file: Path) -> str:
-    """Empty if the file was read or refused in one sentence; else what happened."""
+    """Empty if the file was read or refused in one sentence, otherwise a description of the outcome."""
     try:
         target.read(file)
     except BadInput as error:
@@ -164,7 +164,7 @@ def judge(target: Target, file: Path) -> str:
 
 
 def _confine() -> None:
-    """Limit the memory of this process, and keep the libraries quiet."""
+    """Limit the memory of this process, and silence the libraries."""
     if sys.platform == "linux":
         used = int(Path("/proc/self/statm").read_text("utf-8").split()[0]) * resource.getpagesize()
         resource.setrlimit(resource.RLIMIT_AS, (used + ROOM, used + ROOM))
@@ -178,7 +178,7 @@ def _confine() -> None:
 
 
 def _child(work: Callable[[int], None]) -> tuple[list[str], int]:
-    """Run `work` in a process of its own, which writes lines into the descriptor that it is given; and how it ended."""
+    """Run `work` in its own process, which writes lines to a given descriptor; returns the lines and exit status."""
     read, write_ = os.pipe()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # other threads only wait here
@@ -204,7 +204,7 @@ def _ended(status: int) -> str:
 
 
 def alone(target: Target, file: Path) -> str:
-    """`judge` in a process of its own."""
+    """`judge` in its own process."""
 
     def work(tell: int) -> None:
         signal.setitimer(signal.ITIMER_PROF, SECONDS)
@@ -215,7 +215,7 @@ def alone(target: Target, file: Path) -> str:
 
 
 def batch(target: Target, seed: int, cases: int) -> Iterator[tuple[int, str]]:
-    """Cases that went wrong among `cases` from `seed` on, in a process of its own, with what happened."""
+    """Failures among `cases` cases from `seed` on, run in their own process, with the outcomes."""
 
     def work(tell: int) -> None:
         # The number of each case goes down the pipe before it is tried, and what was wrong after.
@@ -254,7 +254,7 @@ def keep(target: Target, case: int) -> Path:
 
 
 def main() -> None:
-    """Fuzz every target in turn until the time is over."""
+    """Fuzz every target in turn until the time is up."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--seed", type=int, default=0)

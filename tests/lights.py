@@ -1,4 +1,4 @@
-"""A light made by hand on an asymmetrical, anisotropic lattice: what the tests of exported files look at."""
+"""Synthetic light on an asymmetric, anisotropic lattice, for the tests of exported files."""
 
 import numpy as np
 
@@ -11,7 +11,7 @@ ORIGIN, SPACING, SHAPE = (3.0, -40.0, 10.5), (0.5, 1.25, 2.0), (9, 7, 6)
 
 
 def lopsided(direction, origin=ORIGIN):
-    """An egg off the middle: no two of its sides are alike."""
+    """An off-centre egg without any symmetry."""
     axes = np.asarray(direction)
 
     def height(world):

@@ -1,8 +1,9 @@
 """Light transport by plain loops: the oracle that every backend is compared with, path by path.
 
-Written from the specification alone, one ray and one cell at a time, to be obviously right rather than fast: cells come
-from sorting all crossings of the ray with the planes of the lattice, roots from bisection between stationary points.
-Points, directions and normals are lists of three floats in the frame of the scene (see `illumgrid.field.scene.Scene`).
+Written from the specification alone, one ray and one cell at a time, to be evidently correct rather than fast: cells
+come from sorting all crossings of the ray with the planes of the lattice, roots from bisection between stationary
+points. Points, directions and normals are lists of three floats in the frame of the scene (see
+`illumgrid.field.scene.Scene`).
 """
 
 import math
@@ -21,7 +22,7 @@ SNAP = 1e-7
 
 @dataclass(frozen=True)
 class Hit:
-    """Where a ray ends: on a level set, on a cap, or at once because it starts inside a solid.
+    """The end of a ray: on a level set, on a cap, or at once because the ray starts inside a solid.
 
     Parameters
     ----------
@@ -179,7 +180,7 @@ def intervals(solid, u, du, t_in, t_out):
 
 
 def entered(solid, u, du):
-    """Cell that a ray enters which starts at u, or None if it leaves the box."""
+    """Cell entered by a ray that starts at u, or None if the ray leaves the box."""
     cell = [math.floor(u[a]) - (1 if u[a] == math.floor(u[a]) and du[a] < 0 else 0) for a in range(3)]
     return cell if all(0 <= cell[a] < solid.last[a] for a in range(3)) else None
 
@@ -220,7 +221,7 @@ def meet_own(solid, x, d, on):
 
 
 def meet_other(solid, x, d):
-    """Hit of a ray that starts anywhere but on this solid, or None."""
+    """Hit of a ray that does not start on this solid, or None."""
     u, du = solid.index(x), [d[a] / solid.spacing[a] for a in range(3)]
     box = span(solid, u, du)
     if box is None or box[1] <= 0:
@@ -263,7 +264,7 @@ def outward_normal(solid, cell, f):
 
 
 def central_difference(solid, voxel, axis):
-    """Slope of v at a voxel, per voxel; one-sided at the border."""
+    """Central difference of v at a voxel, per voxel; one-sided at the border."""
     before, after = list(voxel), list(voxel)
     before[axis] = max(voxel[axis] - 1, 0)
     after[axis] = min(voxel[axis] + 1, solid.last[axis])
@@ -326,7 +327,7 @@ def lamp_density(scene, number, distance, d):
 
 
 def ask_a_lamp(scene, levels, hit, u, v, choice):
-    """Radiance (3,) from one point of one lamp, by the balance heuristic, as a share of a cosine-distributed path."""
+    """Radiance (3,) from one point of one lamp, weighted by the balance heuristic, per cosine-distributed path."""
     total = 0.0
     for wall, chance in lamps(scene):  # noqa: B007
         total += chance
@@ -351,7 +352,7 @@ def ask_a_lamp(scene, levels, hit, u, v, choice):
 
 
 def first_hit(scene, levels, x, d, on=None):
-    """What a ray meets first.
+    """First hit of a ray.
 
     Parameters
     ----------
@@ -401,14 +402,14 @@ def on_query(scene, query):
 
 
 def is_hole(scene, query):
-    """Whether the one query in `query` has no normal or lies in the solid of a field that is not its own."""
+    """Whether the one query in `query` has no normal or lies in the solid of another field."""
     at = on_query(scene, query)
     others = (k for k in range(len(scene.fields)) if k != at.field)
     return not any(at.normal) or any(Solid(scene, query.level[0], k).holds(at.x) for k in others)
 
 
 def path_worth(scene, query, path, bounces, seed):
-    """Radiance (3,) that one path brings to a query (a `Queries` of length 1 that is no hole)."""
+    """Radiance (3,) that one path contributes to a query (a `Queries` of length 1 that is not a hole)."""
     with np.errstate(over="ignore"):
         key = stream(np.uint64(seed), query.id[0])
         u = [[float(c) for c in draw_pair(key, np.uint64(path), np.uint64(k))] for k in range(bounces + 1)]
@@ -486,7 +487,7 @@ def mixed_differences(worth, many):
 
 
 def net_variance(worth):
-    """Variance of a path, as the next finer net will have it."""
+    """Variance of a path, extrapolated to the next finer net."""
     if len(worth) == 2:
         return (worth[0] - worth[1]) ** 2 / 2
     many = 2 if len(worth) in (128, 512, 2048, 8192) else 3
@@ -500,7 +501,7 @@ def net_variance(worth):
 
 
 def lamplight(scene, channel):
-    """Irradiance from all lamps, were their power spread over a box around the scene, along the axes of field 0."""
+    """Irradiance from all lamps if their power were spread over a box around the scene, along the axes of field 0."""
     points = []
     for volume in (field.volume for field in scene.fields):
         points += [volume.origin, volume.origin + volume.direction @ (volume.spacing * (np.array(volume.shape) - 1))]

@@ -1,6 +1,6 @@
-"""Rays against the meshes of level sets by trying every triangle: what `naive` needs to walk paths over meshes.
+"""Intersection of rays with every triangle of level-set meshes, with which `naive` traces paths over meshes.
 
-`path_worth` and `is_hole` are those of `naive`, which asks here for hits. Double precision, no tree, no grouping.
+`path_worth` and `is_hole` are those of `naive`, with hits from this module. Double precision, no tree, no grouping.
 """
 
 from dataclasses import dataclass
@@ -62,7 +62,7 @@ def mesh_of(scene, levels, number):
 
 
 def first_hit(scene, levels, x, d, on=None):
-    """What a ray meets first, over meshes: see `naive.first_hit`."""
+    """First hit of a ray over meshes: see `naive.first_hit`."""
     x, d = np.array(x, float), np.array(d, float)
     walls = [naive.Wall(scene, k) for k in range(len(scene.quads))]
     hits = [wall.meet(x.tolist(), d.tolist()) for wall in walls if on is None or on.field != wall.number]
@@ -137,7 +137,7 @@ def is_hole(scene, query):
 
 
 def use(monkeypatch):
-    """Let `naive` walk over meshes."""
+    """Let `naive` trace paths over meshes."""
     on_query = naive.on_query
     monkeypatch.setattr(naive, "first_hit", first_hit)
 

@@ -1,4 +1,4 @@
-"""Rooms of quads, questions on their walls, and the law by which one judges a mean."""
+"""Rooms of quads, queries on their walls, and a statistical test of a mean."""
 
 import math
 from dataclasses import replace
@@ -48,12 +48,12 @@ def on_quads(scene, count, t=0.5, seed=0, back=False, only=None, first_id=1 << 5
 
 
 def at_levels(queries, *levels):
-    """The same questions under one row of isovalues."""
+    """The same queries with one row of isovalues."""
     return replace(queries, level=np.tile(np.array(levels, float), (len(queries), 1)))
 
 
 def assert_mean(values, truth, tests=1, slack=0.0):
-    """Independent numbers (n, ...) have the mean `truth`, but for `slack`: judged by their own spread."""
+    """Independent numbers (n, ...) have the mean `truth` up to `slack`, tested with their own standard deviation."""
     values = np.asarray(values, float)
     off = np.abs(values.mean(axis=0) - truth)
     bar = values.std(axis=0, ddof=1) / math.sqrt(len(values))

@@ -1,4 +1,4 @@
-"""Small fields whose surfaces are known, lights made by hand, and what the tests of refusals share."""
+"""Small fields with known surfaces, synthetic lights, and a helper for the tests of refusals."""
 
 from dataclasses import replace
 
@@ -43,7 +43,7 @@ def sky(volume=None, limits=(0.3, 0.9), **more):
 
 
 def refused(call, *words):
-    """The call raises BadInput with one sentence that holds `words`; returns it."""
+    """The call raises BadInput with one sentence that contains `words`; returns the sentence."""
     with pytest.raises(BadInput) as caught:
         call()
     text = str(caught.value)

@@ -1,4 +1,4 @@
-"""Isovalues in equal steps of space: the co-area sums against known fields, and where the levels go."""
+"""Isovalues in equal steps of space: the co-area sums on known fields, and the resulting levels."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Closed forms: every backend agrees with them, and one that is slightly wrong does not."""
+"""Closed forms: every backend agrees with them, and a slightly wrong one does not."""
 
 from dataclasses import dataclass, replace
 

@@ -1,4 +1,4 @@
-"""The bar of a lookup: noise and interpolation, against the truth at isovalues that nobody visited."""
+"""The error bar of a lookup, noise and interpolation, against a reference at unvisited isovalues."""
 
 import numpy as np
 import pytest
@@ -28,7 +28,7 @@ def test_a_straight_line_has_no_bar():
 
 
 def test_a_parabola_is_off_by_an_eighth_of_its_bend_in_the_middle():
-    """Between nodes i and i + 1 of x² the straight line is off by 1/4 = 2/8, which is what the bar says."""
+    """Midway between nodes i and i + 1 of x² linear interpolation is off by 1/4 = 2/8, the value of the bar."""
     lone = grid(polynomial((7, 3, 3), (1, 0, 0)))
     np.testing.assert_allclose(lone.bar, 0.25, rtol=1e-5)
     middle = lone.lookup([[2.5, 1, 1]])[0, 0] - 2.5**2

@@ -1,4 +1,4 @@
-"""Bricks: ranks never say empty where a value reaches the level, and cubes are what the loops say."""
+"""Bricks: ranks never mark a cell empty that reaches the level, and cubes agree with plain loops."""
 
 import numpy as np
 import pytest

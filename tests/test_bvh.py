@@ -1,4 +1,4 @@
-"""Rays meet a mesh where a loop over all triangles says, and never get through; BVH_RAYS=10000000 counts longer."""
+"""Rays hit a mesh where a loop over all triangles does, and never leak; BVH_RAYS=10000000 tests more rays."""
 
 import os
 import subprocess

@@ -1,6 +1,6 @@
-"""Nonsense for every option of every command: refused in a sentence, nothing written; or legal, and then it works.
+"""Invalid values for every option of every command are refused in one sentence and write nothing; valid ones work.
 
-The options are those of the command line itself, so that a new one without its nonsense fails here.
+The options are read from the command line itself, so that a new option without invalid values fails here.
 """
 
 import os
@@ -149,7 +149,7 @@ def own_options(command):
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
-    """A folder with a volume, a finished run, and what is in the way."""
+    """A folder with a volume, a finished run, and obstacles."""
     place = tmp_path_factory.mktemp("nonsense")
     np.save(place / "v.npy", ball(6).values)
     here = os.getcwd()
@@ -170,7 +170,7 @@ def finished(tmp_path_factory):
 
 @pytest.fixture
 def told(finished, capsys, monkeypatch):
-    """Exit code, what was said and what is new after a command; what is new is removed again."""
+    """Exit code, output and new files of a command; the new files are removed again."""
     small = {**preview.render.__kwdefaults__, "width": 24, "height": 18}
     monkeypatch.setattr(preview.render, "__kwdefaults__", small)
     monkeypatch.chdir(finished)
@@ -193,7 +193,7 @@ def told(finished, capsys, monkeypatch):
 
 
 def line(command, option, value):
-    """The command with this value for the option or argument, in place of what it has."""
+    """The command with this value for the option or argument instead of its own."""
     args = BASE[command].split()
     values = value.split("|")
     if not option.startswith("--"):
@@ -209,7 +209,7 @@ def line(command, option, value):
 
 
 def one_sentence(said):
-    """The last line, of the package or of typer's usage, is a sentence; the package says nothing else of it."""
+    """The last line, of the package or of typer's usage, is a sentence, and the package prints no other message."""
     *above, last = said.rstrip().split("\n")
     assert last.startswith(("illumgrid: ", "Error: ")), said
     if last.startswith("illumgrid: "):

@@ -1,4 +1,4 @@
-"""The command line as a process: what it imports, what trouble becomes, what is left when it is stopped or killed."""
+"""The command line as a process: its imports, its errors, and what remains when it is stopped or killed."""
 
 import os
 import random

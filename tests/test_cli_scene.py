@@ -36,7 +36,7 @@ texels = [2, 3]
 
 @pytest.fixture
 def corner(tmp_path):
-    """A scene file and its second volume, in a folder of their own; the first is beside the command."""
+    """A scene file and its second volume in one folder; the first volume is in the working directory."""
     (tmp_path / "in").mkdir()
     np.savez(tmp_path / "in" / "w.npz", values=ball(8).values, origin=(12, 0, 0))
     file = tmp_path / "in" / "corner.toml"

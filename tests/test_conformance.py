@@ -1,4 +1,4 @@
-"""Every stage that the package brings keeps its promises: the suites that plugins subclass, over the registry."""
+"""Every stage of the package meets its requirements: the suites that plugins subclass, run over the registry."""
 
 from illumgrid import registry, testing
 

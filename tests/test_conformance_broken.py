@@ -1,4 +1,4 @@
-"""The conformance suites are tested themselves: each check fails for stages that break its promise."""
+"""Tests of the conformance suites: each check fails for stages that violate its requirement."""
 
 from dataclasses import dataclass, field, make_dataclass, replace
 from itertools import count
@@ -15,7 +15,7 @@ from illumgrid.testing import BackendTests, InterpolatorTests, SamplerTests
 
 
 def sampler(change):
-    """A sampler whose batches are changed: `change` takes the scene, the number of the batch and the batch."""
+    """A sampler with modified batches: `change` takes the scene, the number of the batch and the batch."""
 
     @dataclass(frozen=True)
     class Changed:
@@ -29,7 +29,7 @@ def sampler(change):
 
 
 def backend(change=lambda asked, answer, paths: answer, before=lambda asked: asked, more=0, quick=lambda paths: paths):
-    """The backend `numba` whose questions and answers are changed."""
+    """The backend `numba` with modified queries and samples."""
 
     @dataclass(frozen=True)
     class Changed:
@@ -45,7 +45,7 @@ def backend(change=lambda asked, answer, paths: answer, before=lambda asked: ask
 
 
 def interpolator(change=lambda samples, grid: grid, before=lambda samples: samples):
-    """The interpolator `nearest` whose samples and grids are changed."""
+    """The interpolator `nearest` with modified samples and grids."""
 
     @dataclass(frozen=True)
     class Changed:

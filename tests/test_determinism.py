@@ -1,4 +1,4 @@
-"""The same question gets the same answer, bit for bit, however the work is cut up; another seed gets another."""
+"""Equal queries give equal light, bit for bit, however the work is divided; another seed gives other light."""
 
 from concurrent.futures import ThreadPoolExecutor
 

@@ -1,4 +1,4 @@
-"""What is told before any light is computed: each finding where it belongs, and nothing on clean data."""
+"""Warnings before any light is computed: each in its case, and none on clean data."""
 
 import json
 from pathlib import Path
@@ -21,7 +21,7 @@ def findings(volume, limits, grid=None, inside="above"):
 
 
 def hills(n=48, seed=0, noise=0.0):
-    """A sum of Gaussians in the middle of a unit cube, and white noise."""
+    """A sum of Gaussians in the centre of a unit cube, plus white noise."""
     random = np.random.default_rng(seed)
     peaks = [(random.uniform(0.3, 0.7, 3), random.uniform(0.06, 0.1)) for _ in range(20)]
     volume = sampled(
@@ -150,7 +150,7 @@ def test_components_tunnels_and_cavities(solid, expected):
 
 
 def test_critical_isovalues_are_found_where_they_are():
-    """Two balls of centres 1 apart melt at a distance of 0.5: h = 0.7; a torus closes where its hole does."""
+    """Two balls whose centres are 1 apart merge at a distance of 0.5 (h = 0.7); a torus closes where its hole does."""
     pair = sampled(
         lambda x: 1.2 - np.minimum(*(np.linalg.norm(x - [a, 0, 0], axis=1) for a in (-0.5, 0.5))),
         (61, 41, 41), origin=(-1.5, -1, -1), spacing=(0.05,) * 3,

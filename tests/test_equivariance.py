@@ -1,7 +1,7 @@
-"""Light does not know how the array lies in memory, where it lies in the world, or which sign and unit its values have.
+"""Light is independent of the array's memory layout, its placement in the world, and the sign and unit of its values.
 
-Raw integer noise with nodes on voxels: each node is the corner of eight cells, and whoever picks one of them by the
-order of the axes is found out. The oracle chain cannot: all three implementations could make the same choice.
+Raw integer noise has nodes on voxels. Each node is the corner of eight cells, and a method that selects one of them by
+the order of the axes fails here. The oracle chain cannot detect this: all three implementations could agree on it.
 """
 
 import numpy as np

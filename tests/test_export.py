@@ -1,4 +1,4 @@
-"""Arrays in files for other programs: VTK, SimpleITK, OpenEXR and NumPy find the light where it is in the world."""
+"""Arrays in files for other programs: VTK, SimpleITK, OpenEXR and NumPy find the light at its world position."""
 
 import numpy as np
 import OpenEXR
@@ -18,7 +18,7 @@ EVERYWHERE = [(name, on) for name in DIRECTIONS for on in ("grid", "field")]
 
 
 def expected(light, world, number=0):
-    """The arrays at world points by what the package answers in Python."""
+    """The arrays at world points, as computed by the package in Python."""
     field = light.scene.fields[number]
     h = interpolate(field.volume, world_to_index(field.volume, world))
     return {
@@ -30,7 +30,7 @@ def expected(light, world, number=0):
 
 
 def vtk_points(image):
-    """Where VTK itself says that the points of an image lie."""
+    """Positions of the points of an image, computed by VTK."""
     return np.array([image.GetPoint(k) for k in range(image.n_points)])
 
 

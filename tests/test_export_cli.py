@@ -1,4 +1,4 @@
-"""``illumgrid export``: what it writes, and what it refuses in one sentence."""
+"""``illumgrid export``: its files, and its refusals in one sentence."""
 
 import numpy as np
 import pytest

@@ -16,7 +16,7 @@ from shapes import DIRECTIONS, refused
 
 
 def read_glb(path):
-    """Its JSON, and the arrays of its accessors: by the standard, with no help of a library."""
+    """JSON and accessor arrays of a .glb, read according to the standard without a library."""
     data = path.read_bytes()
     magic, version, length, size, kind = struct.unpack("<4s4I", data[:20])
     assert (magic, version, length, kind) == (b"glTF", 2, len(data), 0x4E4F534A)
@@ -36,7 +36,7 @@ def read_glb(path):
 
 
 def placed(tree, positions):
-    """Positions as a viewer places them: by the matrix of the one node, columns first."""
+    """Positions as placed by a viewer: with the column-major matrix of the only node."""
     matrix = np.reshape(tree["nodes"][0]["matrix"], (4, 4)).T
     return positions @ matrix[:3, :3].T + matrix[:3, 3]
 

@@ -1,4 +1,4 @@
-"""Mutated files: what was once found, and a moment's search for more (see `fuzz.py`)."""
+"""Mutated files: earlier findings, and a short search for more (see `fuzz.py`)."""
 
 import shutil
 import sys

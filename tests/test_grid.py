@@ -1,4 +1,4 @@
-"""The grid: where its nodes lie, what is read between them, and how holes are filled."""
+"""The grid: positions of nodes, lookup between them, and filling of holes."""
 
 import dataclasses
 

@@ -1,4 +1,4 @@
-"""The lines of the page "In PyVista" are run as they stand there, in a process of their own: VTK can take it along."""
+"""The code of the page "In PyVista" runs unchanged, in its own process because VTK can crash it."""
 
 import re
 import subprocess
@@ -18,7 +18,7 @@ BLOCKS = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
 
 
 def drawn(tmp_path, code):
-    """The picture (h, w, 3) that code of the page shows, for a run and an isovalue of this test."""
+    """The picture (h, w, 3) drawn by the page's code, for a run and an isovalue of this test."""
     if not find_library("EGL") and not find_library("OSMesa"):
         pytest.skip("neither EGL nor OSMesa is installed, without which VTK draws nothing off screen")
     code = code.replace("brain-light", str(tmp_path / "light")).replace("brain.vti", str(tmp_path / "ball.vti"))

@@ -31,7 +31,7 @@ def answers(points, mean, stderr=0.0, paths=4, level=0.0, normal=(0, 0, 0)):
 
 
 def cloud(n, spec, seed=0):
-    """World points, even over a grid."""
+    """World points, uniform over a grid."""
     share = np.random.default_rng(seed).random((n, 3))
     return spec.origin + share * (np.array(spec.shape) - 1) * spec.spacing @ spec.direction.T
 
@@ -176,7 +176,7 @@ def test_nodes_beyond_a_cells_diagonal_are_holes_with_the_light_of_the_nearest_n
 
 
 def sheet(z, spec, seed, per=4):
-    """Points even over a plane of constant z, `per` to a squared node spacing."""
+    """Points uniform over a plane of constant z, `per` per squared node spacing."""
     wide = np.array(spec.shape[:2]) - 1
     share = np.random.default_rng(seed).random((int(wide.prod() * per), 2))
     return np.column_stack([share * wide, np.full(len(share), z)])

@@ -1,4 +1,4 @@
-"""The kernels, function by function: compiled, or with NUMBA_DISABLE_JIT=1 as plain Python, whose lines are counted."""
+"""The kernels, function by function: compiled, or with NUMBA_DISABLE_JIT=1 as plain Python, for coverage."""
 
 import math
 

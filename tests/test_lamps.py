@@ -1,4 +1,4 @@
-"""Walls and lamps: naive = reference = numba path by path, holes on walls, no leaks, and honest bars."""
+"""Walls and lamps: naive = reference = numba path by path, holes on walls, no leaks, and bars that cover."""
 
 import math
 from dataclasses import replace
@@ -21,7 +21,7 @@ BACKENDS = {"numba": Numba(), "reference": Reference()}
 
 
 def questions(scene, count, seed=0):
-    """Some on voxels and level sets, as many on both sides of the quads."""
+    """Queries on voxels and level sets, and as many on both sides of the quads."""
     solid = everywhere(scene)
     pick = np.random.default_rng(seed).choice(len(solid), count, replace=False)
     return join_queries([solid[np.sort(pick)], on_quads(scene, count, seed=seed, back="both")])
@@ -104,7 +104,7 @@ def test_a_lamp_inside_a_solid_and_the_back_of_a_lamp_are_dark(backend):
 
 
 def sealed(scale, extents, axes):
-    """Six white walls around next to nothing, light only outside; questions all over."""
+    """Six white walls around an almost empty field, light only outside; queries everywhere."""
     field = empty(spacing=scale * np.array([1.0, 0.7, 1.6]), direction=axes)
     field = replace(field, volume=replace(field.volume, origin=extents * scale * np.array([3.2, -3.2, 3.2])))
     scene = Scene((field,), painted(box_around(field.volume)[:6], 1.0), np.ones(3))
@@ -112,7 +112,7 @@ def sealed(scale, extents, axes):
 
 
 def at_the_corners(scene, queries):
-    """The same questions at the corners of the walls and close to them, from inside and out."""
+    """The same queries at and near the corners of the walls, inside and outside."""
     shift = np.array([0.0, 1e-300, 1e-17, 1e-16, 1e-12, -1e-17, -1e-16])
     shares = np.concatenate([shift, 1 - shift])
     u, v = np.random.default_rng(0).choice(shares, (2, len(queries), 1))

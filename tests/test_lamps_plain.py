@@ -1,4 +1,4 @@
-"""Quads and lamps in the kernels, function by function: compiled, or as plain Python, whose lines are counted."""
+"""Quads and lamps in the kernels, function by function: compiled, or as plain Python, for coverage."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Eight numbers at once: each operation, compiled or with NUMBA_DISABLE_JIT=1 in NumPy, does what it says."""
+"""Operations on eight numbers at once, compiled or with NUMBA_DISABLE_JIT=1 in NumPy."""
 
 import importlib
 import sys

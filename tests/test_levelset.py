@@ -1,4 +1,4 @@
-"""Level sets: as meshes with a known area, closed, turned outwards; and as bricks to march through."""
+"""Level sets as meshes (known area, closed, oriented outwards) and as bricks for marching."""
 
 import numpy as np
 import pytest
@@ -68,7 +68,7 @@ def test_the_mesh_does_not_depend_on_the_scale_of_the_values(power):
 
 
 def blobs(shape=(11, 10, 9), seed=0, top=9):
-    """Smooth random whole numbers from 0 to `top`: ties with every whole isovalue."""
+    """Smooth random integers from 0 to `top`, which tie with every integer isovalue."""
     from scipy.ndimage import gaussian_filter
 
     noise = gaussian_filter(np.random.default_rng(seed).normal(size=shape), 1.5)

@@ -38,7 +38,7 @@ needs_embree = pytest.mark.skipif(not HAVE_EMBREE, reason="embreex is not instal
 
 
 class Brute:
-    """The NumPy path loop over meshes whose every triangle is tried."""
+    """The NumPy path loop over meshes, with a test of every triangle."""
 
     def solve(self, scene, queries, *, paths, bounces, seed):
         mean, m2 = np.zeros((2, len(queries), 3), np.float32)
@@ -122,7 +122,7 @@ def test_kernels_and_embree_agree_on_many_paths(name):
 
 
 def bumps(n):
-    """A smooth field on -1 to 1 whose level sets have hills and hollows, on n voxels a side."""
+    """A smooth field on [-1, 1]³ whose level sets have hills and hollows, with n voxels per side."""
 
     def h(x):
         return 0.8 - np.linalg.norm(x, axis=1) + 0.12 * np.sin(5 * x[:, 0]) * np.cos(4 * x[:, 1] + x[:, 2])

@@ -1,4 +1,4 @@
-"""The package about itself: every module stands alone, every public name is there and explained."""
+"""The package as a whole: every module imports alone, every public name exists and has a docstring."""
 
 import inspect
 import pkgutil

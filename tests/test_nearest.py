@@ -1,4 +1,4 @@
-"""The nearest answer at every node: the identity on direct queries, and honest about what is out of reach."""
+"""The nearest sample at every node: the identity for `direct`, and holes beyond its reach."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ FIELD = sky(ball(6), (0.3, 0.9)).fields[0]
 
 
 def answers(points, mean, paths=None, m2=None):
-    """Samples at world points; of a query the interpolator may read the point only."""
+    """Samples at world points; the interpolator may read only the points of the queries."""
     n = len(points)
     mean = np.broadcast_to(np.asarray(mean, np.float32), (n, 3)).copy()
     paths = np.full(n, 4) if paths is None else np.asarray(paths)

@@ -1,4 +1,4 @@
-"""Nodes to fill: they know place, level and normal; interpolators written before there were any run unchanged."""
+"""Nodes to fill: position, level and normal; interpolators with the former signature run unchanged."""
 
 from dataclasses import dataclass
 from types import SimpleNamespace
@@ -52,7 +52,7 @@ def test_a_grid_of_flat_arrays_has_its_holes_filled():
 
 @dataclass(frozen=True)
 class Bins:
-    """As the page on plugins had it when an interpolator took (samples, spec, field)."""
+    """The example of the plugins page when an interpolator took (samples, spec, field)."""
 
     name: ClassVar[str] = "bins"
 

@@ -1,4 +1,4 @@
-"""The view in a notebook: executed by a kernel, and the widget's script led by a model in a browser."""
+"""The view in a notebook: executed by a kernel, and the widget's script driven by a model in a browser."""
 
 import base64
 import builtins

@@ -1,4 +1,4 @@
-"""Loops, NumPy and compiled kernels walk the same paths: naive = reference = numba, one path at a time."""
+"""Loops, NumPy and compiled kernels trace the same paths: naive = reference = numba, path by path."""
 
 import math
 from collections import Counter

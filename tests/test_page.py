@@ -1,4 +1,4 @@
-"""The page in a real browser: its pixels are those of the still picture, and hands, keys and addresses move it."""
+"""The page in a browser: its pixels equal those of the still picture, and mouse, keys and addresses control it."""
 
 from dataclasses import replace
 
@@ -16,7 +16,7 @@ SCENES = {"bent": coloured(bent()), "pair": coloured(pair())}
 
 
 def alike(one, other):
-    """The same picture, but for outlines, which are refined as far as time allows."""
+    """The same picture except for outlines, whose refinement depends on time."""
     off = np.abs(one - other).max(axis=2)
     return off.mean() < 1.5 and np.quantile(off, 0.9) <= 4
 

@@ -1,4 +1,4 @@
-"""The page without a browser: its source, what it carries, and how it is served."""
+"""The page without a browser: its source, its data, and its server."""
 
 import gzip
 import re

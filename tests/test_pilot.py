@@ -1,4 +1,4 @@
-"""What the pilot knows before a grid is built, against grids that are built."""
+"""Predictions of the pilot against grids that are built."""
 
 import numpy as np
 import pytest
@@ -28,7 +28,7 @@ BACKEND = Numba()
 
 
 def bumps(n, count, seed, widths=(0.15, 0.4)):
-    """Sum of Gaussians of random place and width, on -1 to 1."""
+    """Sum of Gaussians of random position and width on [-1, 1]³."""
     random = np.random.default_rng(seed)
     centres, sigmas = random.uniform(-0.6, 0.6, (count, 3)), random.uniform(*widths, count)
 
@@ -183,7 +183,7 @@ def test_the_least_time_for_an_error_and_the_least_error_for_a_time():
 
 
 class Clock:
-    """A machine that walks a path in some seconds, which may change."""
+    """A machine with a given time per path, which may change."""
 
     def __init__(self, pace):
         self.now, self.pace = 0.0, pace
@@ -218,7 +218,7 @@ def test_a_machine_that_slows_down_is_late_by_what_it_slowed_last():
 
 
 def test_the_pilot_of_an_error_climbs_to_finer_grids_where_its_first_choice_will_not_do(monkeypatch):
-    """The first look sees few points, and may find a grid good enough by chance."""
+    """The first look uses few points and may accept a grid by chance."""
     scene, looks = FIELDS["few bumps"](), []
 
     def lucky(pilot, grid, fewer, bounces, paths):

@@ -1,4 +1,4 @@
-"""The page for authors of plugins: its code works, and every hook and argument stands in it."""
+"""The page for authors of plugins: its code works, and it documents every hook and argument."""
 
 import importlib
 import inspect

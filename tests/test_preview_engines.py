@@ -1,4 +1,4 @@
-"""The engines draw one picture: same places, same tones; and what happens where an OpenGL library is missing."""
+"""All engines draw the same picture, in position and tone; behaviour without an OpenGL library."""
 
 import os
 import subprocess
@@ -23,7 +23,7 @@ SIZE = {"width": 200, "height": 150}
 
 
 def varied(light, seed=0):
-    """The same illumination with light that changes from place to place, and from row to row on the walls."""
+    """The same illumination with light that varies over space, and over rows on the walls."""
     random = np.random.default_rng(seed)
     grids, walls = [], []
     for grid in light.grids:
@@ -35,7 +35,7 @@ def varied(light, seed=0):
 
 
 def chiral(direction):
-    """Three balls of different size and colour, a sense of rotation that a mirror would turn."""
+    """Three balls of different size and colour, whose sense of rotation a mirror would invert."""
     shape, spacing = np.array([30, 27, 33]), 2 / (np.array([30, 27, 33]) - 1)
     fields = []
     for number, (at, radius) in enumerate((((0.6, 0, 0), 0.3), ((0, -0.6, 0), 0.22), ((0, 0, 0.6), 0.38))):
@@ -68,7 +68,7 @@ def far_away():
 
 
 def pictures(engine):
-    """Everything that engines are compared by."""
+    """All pictures by which engines are compared."""
     drawn = {}
     scenes = {"oblique": chiral(OBLIQUE), "mirrored": chiral(MIRRORED), "room": room(), "cap": cut_open(),
               "far": far_away()}  # fmt: skip
@@ -90,7 +90,7 @@ ALL = [f"{n}, {light}" for n in NAMES for light in ("global", "local")] + [
 
 
 def child(script, folder, **environment):
-    """Run Python in a process of its own: a process has one OpenGL."""
+    """Run Python in its own process, since a process can have only one OpenGL."""
     here = os.path.dirname(__file__)
     return subprocess.run(
         [sys.executable, "-c", script], cwd=folder, capture_output=True, text=True, timeout=300,

@@ -1,4 +1,4 @@
-"""``preview --trust``: colours of error bars, their scale, holes, and what is said where bars say too little."""
+"""``preview --trust``: colours of error bars, their scale, holes, and the note where bars are a lower bound."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ GROUND = np.full(3, 60, np.uint8)
 
 
 def barred(bar, scene=None, nodes=9):
-    """Light of 2 everywhere, whose nodes are each off by `bar` times that between the nodes."""
+    """Light of 2 everywhere, with bars of `bar` times that."""
     light = lit(scene or sky(), 2.0, nodes)
     for grid in light.grids:
         grid.error[:] = 2 * bar * np.sqrt(27 / 8)  # what a lookup keeps of it
@@ -23,13 +23,13 @@ def barred(bar, scene=None, nodes=9):
 
 
 def middle(picture):
-    """Display-linear colour of the surface in the middle of the object, which faces the eye."""
+    """Display-linear colour at the centre of the object, where it faces the viewer."""
     rows = len(picture) - len(scale(barred(0.1), *picture.shape[1::-1], GROUND))
     return decode_srgb(picture)[rows // 2 - 3 : rows // 2 + 3, picture.shape[1] // 2 - 3 :][:, :6].mean(axis=(0, 1))
 
 
 def is_red(picture):
-    """The red of holes: neither on the scale nor between two of its colours."""
+    """The red of holes, which is neither on the scale nor between two of its colours."""
     colors = decode_srgb(picture)
     return colors[..., 0] > 3 * colors[..., 1:].max(axis=-1)
 

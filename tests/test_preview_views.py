@@ -1,4 +1,4 @@
-"""Where a picture is seen from: named views, angles, zoom, one camera for a whole sweep; the grid as a block."""
+"""Viewpoints of pictures: named views, angles, zoom, one camera for a whole sweep; the grid as a block."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Onto a level set: near points arrive, and none that says so is elsewhere."""
+"""Projection onto a level set: near points arrive, and every point reported as arrived lies on it."""
 
 import warnings
 

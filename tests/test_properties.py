@@ -1,6 +1,6 @@
-"""Laws that light keeps on any field: hypothesis looks for the one on which it does not.
+"""Properties of light on any field; hypothesis searches for a counterexample.
 
-What holds path by path is asserted exactly: with equal seeds the paths of two scenes are the same paths.
+Properties that hold path by path are asserted exactly: with equal seeds, two scenes share their paths.
 """
 
 from dataclasses import replace
@@ -125,7 +125,7 @@ def test_the_unit_of_space_and_of_the_values_changes_no_bit(volume, scale, shift
 @laws
 @given(volumes(), st.integers(0, 47))
 def test_turned_and_mirrored_arrays_hold_the_same_light(volume, which):
-    """All 48 ways to permute and flip the axes; directions differ, so that means are compared with their errors."""
+    """All 48 permutations and flips of the axes; directions differ, so means are compared within their errors."""
     axes = [p for p in np.ndindex(3, 3, 3) if len(set(p)) == 3][which // 8]
     flips = [k for k in range(3) if which >> k & 1]
     here = Scene((field(volume),), background=np.ones(3))
@@ -148,7 +148,7 @@ def test_turned_and_mirrored_arrays_hold_the_same_light(volume, which):
 @laws
 @given(sizes, st.floats(0.05, 0.9), st.integers(0, 4))
 def test_where_the_field_shows_nothing_the_walls_have_their_closed_form(shape, albedo, bounces):
-    """A level beyond the data is an empty set: walls of albedo a and emission 1 - a see π (1 - a^(B+1))."""
+    """A level beyond the data is an empty set: walls of albedo a and emission 1 - a receive π (1 - a^(B+1))."""
     values = np.zeros(shape, np.float32)
     values[0, 0, 0] = 1.0
     volume = Volume(values)

@@ -1,4 +1,4 @@
-"""Quads and the presets made of them: what is refused, which side is the front, what stands where."""
+"""Quads and presets: refused values, front sides, and positions."""
 
 import itertools
 
@@ -21,7 +21,7 @@ ALL = DIRECTIONS | PERMUTED
 
 
 def volume(direction):
-    """No two sides alike, far from the origin of the world."""
+    """A volume without symmetry, far from the world's origin."""
     return Volume(np.random.default_rng(0).random((4, 6, 9)), (10, -20, 30), (0.5, 1.0, 0.25), direction)
 
 

@@ -1,4 +1,4 @@
-"""Volumes of every kind come back as they were written, where they were."""
+"""Volumes of every format are read back with the values and the placement that were written."""
 
 import struct
 from pathlib import Path

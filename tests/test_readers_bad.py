@@ -1,4 +1,4 @@
-"""What is broken, hostile or of another kind is told in a sentence, without a large allocation."""
+"""Broken, hostile and foreign files are refused in one sentence, without a large allocation."""
 
 import gzip
 import io
@@ -168,7 +168,7 @@ def test_tiff_that_runs_in_a_circle(tmp_path):
 
 @pytest.fixture
 def lean(tmp_path, monkeypatch):
-    """The test may not even reserve much memory, and must leave no temporary file."""
+    """The test must not reserve much memory, nor leave a temporary file."""
     if sys.platform != "linux":
         pytest.skip("only Linux limits the address space and tells how much is in use")
     folder = tmp_path / "temporary"

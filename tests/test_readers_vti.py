@@ -1,4 +1,4 @@
-"""VTK image data written by VTK comes back as it was, where it was; what is broken or hostile is told in a sentence."""
+"""VTK image data written by VTK is read back with its placement; broken and hostile files are refused."""
 
 import sys
 

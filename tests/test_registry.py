@@ -1,4 +1,4 @@
-"""Stages by name: whose they are, what is broken and by whom, and what happens when two claim one name."""
+"""Stages by name: their origin, errors attributed to plugins, and names claimed twice."""
 
 import sys
 import warnings
@@ -52,7 +52,7 @@ def register_samplers():
 
 @pytest.fixture(autouse=True)
 def fresh(monkeypatch):
-    """No plugin but those that a test installs."""
+    """No plugins except those that a test installs."""
     others = {d.dist.name for d in registry.entry_points(group="illumgrid")}
     monkeypatch.setenv(registry.SWITCH, ",".join(sorted(others)))
     registry._told_of.clear()
@@ -63,7 +63,7 @@ def fresh(monkeypatch):
 
 @pytest.fixture
 def install(tmp_path, monkeypatch):
-    """Put a package on the path as pip would: a module and the folder that says which entry points it has."""
+    """Put a package on the path as pip would: a module and the folder with its entry points."""
     monkeypatch.syspath_prepend(tmp_path)
 
     def install(package, source, version="1.0"):
@@ -80,7 +80,7 @@ def install(tmp_path, monkeypatch):
 
 
 def told():
-    """What is warned of when the registry is read."""
+    """Warnings issued when the registry is read."""
     with warnings.catch_warnings(record=True) as heard:
         warnings.simplefilter("always")
         registry.entries()

@@ -1,4 +1,4 @@
-"""Walls and lamps against closed forms. Means over many questions are judged by their own spread."""
+"""Walls and lamps against closed forms. Means over many queries are tested with their own standard deviation."""
 
 import math
 from dataclasses import replace
@@ -21,7 +21,7 @@ X, Y, Z = np.eye(3)
 
 
 def lambert(point, normal, quad):
-    """Irradiance (n,) from a lamp of radiance 1 that is all above the horizon: (1/2) Σ angle · (edge normal · n)."""
+    """Irradiance (n,) from a lamp of radiance 1 entirely above the horizon: (1/2) Σ angle · (edge normal · n)."""
     r = np.array([quad.corner, quad.corner + quad.edge_u, quad.corner + quad.edge_u + quad.edge_v])
     r = np.array([*r, quad.corner + quad.edge_v])[:, None] - point
     r /= np.linalg.norm(r, axis=2, keepdims=True)

@@ -1,4 +1,4 @@
-"""Where light is asked for: at the nodes that a lookup can touch, or strewn evenly over level sets."""
+"""Positions of queries: at the nodes that a lookup can read, or scattered uniformly over level sets."""
 
 from fractions import Fraction
 from itertools import product

@@ -1,4 +1,4 @@
-"""Queries: each on the level set of its own row. Samples: answers with honest errors."""
+"""Queries, each on the level set of its own row, and samples with error bars that cover."""
 
 from dataclasses import replace
 

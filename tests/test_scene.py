@@ -1,4 +1,4 @@
-"""Scenes: what they take, the range that is suggested, the common sweep, and the frame."""
+"""Scenes: accepted values, the suggested range, the common sweep, and the frame."""
 
 import re
 from pathlib import Path
@@ -156,7 +156,7 @@ def test_constant_values_have_no_isosurface(inside):
 
 
 def known_isovalues():
-    """Isovalues worth seeing, by file, from the table of SOURCES.md: only plain ranges such as 40-200."""
+    """Recommended isovalues by file, from the table of SOURCES.md: only plain ranges such as 40-200."""
     rows = (VOLUMES / "SOURCES.md").read_text("utf-8").splitlines()
     cells = [[c.strip() for c in row.split("|")[1:-1]] for row in rows if row.startswith("|")]
     column = cells[0].index("isovalues")

@@ -1,4 +1,4 @@
-"""Scene files: what they say is what is made; what is wrong is told by file, table and key."""
+"""Scene files: correct ones are built as written; messages about wrong ones name file, table and key."""
 
 import numpy as np
 import pytest
@@ -45,7 +45,7 @@ QUAD = '[[quad]]\nname = "lamp"\ncorner = [0, 0, 0]\nedge_u = [1, 0, 0]\nedge_v 
 
 @pytest.fixture
 def read(tmp_path):
-    """The scene that a text says, from a folder with two volumes."""
+    """The scene that a text describes, read from a folder with two volumes."""
     (tmp_path / "data").mkdir()
     np.save(tmp_path / "data" / "n.npy", ball(8).values)
     np.save(tmp_path / "p.npy", ball(9).values)

@@ -1,4 +1,4 @@
-"""The spread of a mean: as three implementations tell it, and whether it is that of the mean."""
+"""The variance of a mean: equal in three implementations, and equal to the observed one."""
 
 import math
 
@@ -95,7 +95,7 @@ missed = pytest.mark.xfail(strict=True, reason="a lone opening of about a path's
 
 @pytest.mark.parametrize("share", [0.03, 0.1, 0.3, *(pytest.param(s, marks=missed) for s in (0.5, 0.7, 0.9, 1.2)), 2.0])
 def test_light_that_no_path_met_is_within_the_bar(share):
-    """An opening of `share` of a path's box, dark before a bright sky or bright in the dark."""
+    """An opening of `share` of a path's box: dark against a bright sky, or bright in the dark."""
     paths = range(64)
     u, v = net(paths)
     side = math.sqrt(share / len(paths))

@@ -1,7 +1,7 @@
-"""Where methods fail: one scene for each hard case, and every sampler and interpolator of the package on each.
+"""Where methods fail: one scene for each hard case, with every sampler and interpolator of the package.
 
-Light is finite, not negative, no brighter than what can be seen, and told where it is missing; what a case demands
-beyond that stands below. The page docs/stability.md says how far each method is off.
+Light is finite, not negative, no brighter than anything visible, and reported where missing; further requirements of a
+case are stated below. The page docs/stability.md gives the error of each method.
 """
 
 import warnings
@@ -51,7 +51,7 @@ def overlapping():
 
 
 def with_lamp(shift):
-    """A ball of radius 0.3 to 0.9 and a lamp: at 0 in its middle, at 0.6 across its surface in mid sweep."""
+    """A ball of radius 0.3 to 0.9 and a lamp: at 0 in its centre, at 0.6 across its surface in mid sweep."""
     scene = sky(ball(9), (0.3, 0.9))
     u, v = np.array([0.2, 0, 0]), np.array([0, 0.2, 0])
     lamp = ig.Quad("lamp", [-0.1, -0.1, shift], u, v, Material(np.zeros(3), np.ones(3)), (2, 2))
@@ -59,7 +59,7 @@ def with_lamp(shift):
 
 
 def sealed():
-    """All albedo 1, in a box without openings: what the lamp emits goes round for as long as anybody looks."""
+    """Albedo 1 everywhere, in a box without openings: the light of the lamp is reflected without end."""
     white = Material(np.ones(3))
     quads = tuple(replace(q, material=white, texels=(2, 2)) for q in box_around(ball(9))[:6])
     lamp = replace(box_around(ball(9))[6], material=Material(np.ones(3), np.full(3, 0.01)))
@@ -124,7 +124,7 @@ def test_light_stays_light(case, sampler, interpolator):
 
 @pytest.mark.parametrize("sampler, interpolator", list(product(SAMPLERS, INTERPOLATORS)))
 def test_where_no_level_set_is_everything_is_a_hole_and_nothing_is_black(sampler, interpolator):
-    """The range begins where the data end: a sweep over nothing."""
+    """The range begins where the data end: the sweep is empty."""
     scene = sky(ball(9), (float(ball(9).values.max()), 3.0))
     grid = lit(scene, sampler, interpolator).grids[0]
     assert np.isfinite(grid.values).all() and (np.isinf(grid.error) == (grid.support == 0)).all()
@@ -151,7 +151,7 @@ def test_a_lamp_across_the_surface_lights_what_sticks_out_only():
 
 
 def test_albedo_one_goes_on_for_ever_and_adds_up():
-    """The walls' own closed form with a = 1: each reflection brings as much light as the first."""
+    """The closed form of the walls with a = 1: each reflection adds as much light as the first."""
     scene = sealed()
     wall = scene.quads[1]
     asked = ig.Queries(
@@ -194,7 +194,7 @@ def test_constant_data_are_refused_and_said_why():
 
 
 def test_tangent_rays_neither_stick_nor_leak():
-    """Rays that graze a ball: nearer than its radius they hit, farther they pass, and on the rim they do either."""
+    """Rays that graze a ball: closer than its radius they hit, farther they pass, and on the rim either is allowed."""
     from illumgrid.backends.kernels import MISS, SURFACE, cast_rays
     from illumgrid.field.levelset import marchable
 

@@ -1,4 +1,4 @@
-"""A finished run on the disk: bit by bit the same when it comes back, whole or not there, and never trusted."""
+"""A finished run on disk: read back bit by bit, complete or absent, and never trusted."""
 
 import dataclasses
 import os
@@ -32,7 +32,7 @@ def wall(quad: Quad, rows: int, rng: np.random.Generator) -> WallTexture:
 
 
 def example(count: int = 1, seed: int = 0, direction=MIRRORED) -> store.Stored:
-    """One field, or two that differ in all that can differ, between walls, on lattices with no two sides alike."""
+    """One field, or two that differ in every respect, between walls, on lattices without symmetry."""
     rng = np.random.default_rng(seed)
     first = Volume(rng.normal(size=(4, 7, 5)), (1 / 3, -1e5, 2e-7), (0.1, 1 / 7, 3), direction)
     second = Volume(rng.normal(size=(3, 2, 6)) * 1e20, (0.1, 0.2, 0.3), (1, 2, 3), direction)
@@ -58,7 +58,7 @@ def example(count: int = 1, seed: int = 0, direction=MIRRORED) -> store.Stored:
 
 
 def assert_same(one: store.Stored, other: store.Stored) -> None:
-    """Bit by bit, so that -0.0, NaN and infinities count too."""
+    """Compare bit by bit, including -0.0, NaN and infinities."""
 
     def bits(stored: store.Stored) -> list:
         rest: list = []

@@ -1,4 +1,4 @@
-"""A folder that says it holds a finished run is not trusted: BadInput, or the right result."""
+"""A folder that claims to hold a finished run is not trusted: reading raises BadInput or gives the right result."""
 
 import json
 import os
@@ -22,7 +22,7 @@ def out(tmp_path: Path) -> Path:
 
 
 def reseal(folder: Path, **changes) -> None:
-    """Forge the record so that its checksum agrees with what is there now."""
+    """Forge the record so that its checksum matches the current content."""
     record = json.loads((folder / store.RUN).read_text("utf-8")) | changes
     (folder / store.RUN).write_text(json.dumps(record | {"checksum": store._checksum(record, folder / store.EXR)}))
 
@@ -54,7 +54,7 @@ def test_a_format_of_the_future(out):
 
 
 def forge(folder: Path, *way: str | int, value: object = None, remove: bool = False) -> None:
-    """Change one entry of the record, and the checksum with it, so that only the entry itself can be found out."""
+    """Change one entry of the record and the checksum with it, so that only the entry itself can be detected."""
     record = json.loads((folder / store.RUN).read_text("utf-8"))
     at = record
     for key in way[:-1]:
@@ -140,7 +140,7 @@ def test_numbers_that_json_does_not_have(out, token):
     ids=str,
 )
 def test_another_kind_of_exr_file_is_refused(out, disguise):
-    """Whose header could claim more than the bound of deflate, or mean something else."""
+    """Its header could claim more than the bound of deflate, or have another meaning."""
     parts = OpenEXR.File(str(out / store.EXR)).parts
     for part in parts:
         part.header.pop("chunkCount", None)
@@ -197,7 +197,7 @@ def test_damage_is_found_or_does_no_harm(out, name):
 
 
 def test_damage_under_a_forged_checksum_is_no_crash(out, capfd):
-    """What the checksum keeps from the EXR library in practice: nothing but BadInput or arrays of the right shapes."""
+    """The checksum normally keeps such damage from the EXR library: only BadInput or right shapes may result."""
     refused = 0
     for damaged in mutations((out / store.EXR).read_bytes(), 300, seed=2):
         (out / store.EXR).write_bytes(damaged)

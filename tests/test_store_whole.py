@@ -1,4 +1,4 @@
-"""A finished run is whole or not there: through exceptions, a full disk, kills, and others at the same place."""
+"""A finished run is complete or absent: through exceptions, a full disk, kills, and concurrent runs."""
 
 import os
 import random
@@ -29,7 +29,7 @@ def out(tmp_path: Path) -> Path:
 )
 @pytest.mark.parametrize("where", ["_write_exr", "_checksum", "_read_exr", "_refuse_foreign"])
 def test_trouble_leaves_nothing_behind(tmp_path, monkeypatch, where, trouble):
-    """Also on the way between the two renames, where an older run is put back."""
+    """Also between the two renames, where the older run is restored."""
     out = tmp_path / "out"
     for old in (None, example()):
         if old:
@@ -54,7 +54,7 @@ def test_trouble_leaves_nothing_behind(tmp_path, monkeypatch, where, trouble):
 
 
 def write_with_little_room(folder: str, room: int) -> None:
-    """In a process of its own: files may not grow beyond `room` bytes."""
+    """Run in its own process: files may not grow beyond `room` bytes."""
     resource.setrlimit(resource.RLIMIT_FSIZE, (room, room))
     try:
         store.write(folder, example(), None, False)
@@ -70,7 +70,7 @@ def in_another_process(call: str) -> str:
 
 
 def test_a_full_disk_is_noticed(out):
-    """Also where but the last byte is missing, which the EXR library does not report."""
+    """Also if only the last byte is missing, which the EXR library does not report."""
     size = (out / store.EXR).stat().st_size
     for room in (0, size // 2, size - 1):
         said = in_another_process(f"write_with_little_room({str(out.with_name('full'))!r}, {room})")
@@ -80,9 +80,9 @@ def test_a_full_disk_is_noticed(out):
 
 
 def write_until_killed(folder: str, rounds: int) -> None:
-    """In a process of its own that has not used the EXR library's threads: forked writers, killed at random moments.
+    """Run in its own process, which has not used the EXR library's threads: forked writers, killed at random moments.
 
-    In every other round the first result is awaited, so that it is the second or a later one that is cut off.
+    Every other round waits for the first result, so that the second or a later one is interrupted.
     """
     pick = random.Random(0)
     for number in range(rounds):

@@ -1,4 +1,4 @@
-"""Light against closed forms: white furnaces, convex bodies, sealed cavities, honest bars."""
+"""Light against closed forms: white furnaces, convex bodies, sealed cavities, and bars that cover."""
 
 import math
 
@@ -29,7 +29,7 @@ BACKENDS = {"numba": Numba(), "reference": Reference()}
 
 
 def slabs():
-    """Solids that run from border to border, so that paths meet caps, and one field more to send them there."""
+    """Solids that extend from border to border, so that paths hit caps, and another field that reflects paths there."""
     return furnace(linear((1, 0, 0)), noise(9, (5, 5, 5), origin=(7.0, 1.0, -1.0)))
 
 
@@ -131,12 +131,12 @@ WALL = 300.0
 
 
 def cavity(values, **placement):
-    """Shut in by voxels that are solid at all levels below WALL: none of those level sets reaches the outside."""
+    """A cavity in voxels that are solid at all levels below WALL: none of its level sets reaches the outside."""
     return Volume(np.pad(np.asarray(values, np.float32), 1, constant_values=WALL), **placement)
 
 
 def sealed(volume, inside="above", high=256.0):
-    """Mirrors all over, light only outside; and queries on voxels and level sets within."""
+    """Albedo 1 everywhere and light only outside, with queries on voxels and level sets inside."""
     limits = (-0.5, high) if inside == "above" else (-high, 0.5)
     scene = Scene.sky(volume, (1, 1, 1), limits, inside)
     queries = everywhere(scene)

@@ -1,4 +1,4 @@
-"""Pictures: tones of the standard, never mirrored however the array is stored, and the whole object in view."""
+"""Pictures: standard sRGB tones, no mirroring for any storage order, and the whole object in view."""
 
 import io
 

@@ -1,4 +1,4 @@
-"""The compiled lookup is SciPy's trilinear interpolation at the place that `world_to_index` says, to the last bit."""
+"""The compiled lookup equals SciPy's trilinear interpolation at the index of `world_to_index`, to the last bit."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Volumes: where their voxels lie, what lies between them, and which way is out."""
+"""Volumes: positions of voxels, interpolation between them, and outward normals."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The light of walls: read between texels, filled where a texel lies in a solid, kept on the disk, shown."""
+"""The light of walls: interpolated between texels, filled where a texel lies in a solid, stored, and shown."""
 
 import json
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""Scenes and judgements that the tests of light transport share."""
+"""Scenes and statistical tests shared by the tests of light transport."""
 
 import math
 from statistics import NormalDist
@@ -36,7 +36,7 @@ def rotation(seed=8):
 
 
 def furnace(*volumes, inside="above", albedo=ALBEDO, share=(0.3, 0.7)):
-    """Emission 1 - albedo under a white sky: a path that escapes is worth 1, one that does not 1 - albedo^(B + 1)."""
+    """Emission 1 - albedo under a white sky: a path that escapes contributes 1, any other 1 - albedo^(B + 1)."""
     albedo = np.asarray(albedo) * np.ones(3)
     fields = []
     for number, volume in enumerate(volumes):
@@ -47,7 +47,7 @@ def furnace(*volumes, inside="above", albedo=ALBEDO, share=(0.3, 0.7)):
 
 
 def colored(scene, background=SKY):
-    """The same solids with light by which paths can be told apart."""
+    """The same solids with light that distinguishes paths."""
     materials = [Material(ALBEDO, EMISSION), Material(ALBEDO[::-1], 0.5 * EMISSION[::-1])]
     fields = (Field(f.name, f.volume, m, f.range, f.inside) for f, m in zip(scene.fields, materials))
     return Scene(tuple(fields), background=background)
@@ -76,7 +76,7 @@ def everywhere(scene):
 
 
 def worth(backend, scene, queries, path, bounces, seed=0):
-    """What one path is worth at each query (n, 3), and which queries are answered (n,)."""
+    """Contribution of one path at each query (n, 3), and which queries are not holes (n,)."""
     answer = backend.solve(scene, queries, paths=range(path, path + 1), bounces=bounces, seed=seed)
     return answer.mean.astype(float) / math.pi, answer.paths == 1
 
@@ -87,7 +87,7 @@ def sidak(tests, level=1e-4):
 
 
 def assert_standard_normal(z):
-    """No |z| is too large, and neither their mean nor the mean of their squares is off."""
+    """No |z| is too large, and their mean and mean square are those of standard normal numbers."""
     z = np.asarray(z).ravel()
     worst = np.abs(z).max()
     assert worst < sidak(z.size), f"|z| = {worst:.2f} among {z.size}, at {np.abs(z).argmax()}"

@@ -39,7 +39,7 @@ def zipped(path):
 
 
 def refused(path, *words):
-    """Reading says one sentence that names the file and holds `words`."""
+    """Reading is refused in one sentence that names the file and contains `words`."""
     with pytest.raises(BadInput) as caught:
         read_volume(path)
     text = str(caught.value)
@@ -50,7 +50,7 @@ def refused(path, *words):
 
 
 def refused_lightly(path, *words):
-    """Refused before anything large was reserved: not because the machine had no memory left."""
+    """Refused before any large allocation, and not because the machine ran out of memory."""
     text = refused(path, *words)
     assert "memory" not in text and "alloc" not in text
 
