@@ -15,7 +15,7 @@ GROUND = np.full(3, 60, np.uint8)
 
 
 def barred(bar, scene=None, nodes=9):
-    """Light of 2 everywhere, with bars of `bar` times that."""
+    """Light of 2 everywhere, with a relative bar of `bar` midway between nodes."""
     light = lit(scene or sky(), 2.0, nodes)
     for grid in light.grids:
         grid.error[:] = 2 * bar * np.sqrt(27 / 8)  # what a lookup keeps of it
