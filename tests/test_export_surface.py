@@ -129,7 +129,7 @@ def test_names_in_other_alphabets(tmp_path):
 def test_an_isovalue_without_light_or_surface_is_refused(tmp_path):
     light = lopsided_light(np.eye(3))
     write = exports.write
-    refused(lambda: write(light, tmp_path / "a.glb", isovalue=0.9), "0.9", "'egg'", "0.55 to 0.85", "--range")
+    refused(lambda: write(light, tmp_path / "a.glb", isovalue=0.9), "0.9", "'egg'", "0.55 to 0.85", "wider range")
     refused(lambda: write(light, tmp_path / "a.glb", isovalue=np.nan), "nan", "finite")
     object.__setattr__(light.scene.fields[0], "range", np.array([2.0, 3.0]))
     refused(lambda: write(light, tmp_path / "a.ply"), "no surface at isovalue 2.5", "between")

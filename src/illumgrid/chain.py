@@ -16,7 +16,6 @@ from illumgrid.constants import PATHS
 from illumgrid.errors import BadInput, tell
 from illumgrid.field.lattice import nodes_over
 from illumgrid.field.scene import Scene, level_table
-from illumgrid.grid import IlluminationGrid
 from illumgrid.io import store
 from illumgrid.light import Illumination
 from illumgrid.stages import Backend, Interpolator, Sampler
@@ -148,7 +147,7 @@ def run(
         "queries": baked.queries,
         "holes": list(baked.holes),
         "seconds": {stage: round(seconds, 3) for stage, seconds in baked.seconds.items()},
-        "relative_error": _relative_error(baked.grids),
+        "relative_error": [grid.relative_error for grid in baked.grids],
         "plan": None if plan is None else asdict(plan),
         "reached": reached,
         "versions": {name: version(name) for name in ("illumgrid", "numpy", "numba", "scipy")},
@@ -169,13 +168,3 @@ def _check_plannable(error: float | None, seconds: float | None, sampler: Any, b
             f"an error or a time was asked for with {sampler.name}, {backend.name} and {interpolator.name}; expected "
             "direct, a backend that marches level sets, and nearest: 'illumgrid bench' measures the others"
         )
-
-
-def _relative_error(grids: tuple[IlluminationGrid, ...]) -> list[float | None]:
-    """For each grid, root mean square standard error of its nodes over their mean irradiance; None below two paths."""
-    result: list[float | None] = []
-    for grid in grids:
-        known = np.isfinite(grid.error) & (grid.support > 0)
-        mean = float(grid.values[known].mean()) if known.any() else 0.0
-        result.append(float(np.sqrt(np.square(grid.error[known], dtype=float).mean())) / mean if mean > 0 else None)
-    return result

@@ -46,7 +46,7 @@ class Illumination:
     @cached_property
     def exposure(self) -> float:
         """Automatic exposure: one for all isovalues, views and fields, from the light that the grids hold."""
-        lit = [grid.values[grid.support > 0] for grid in self.grids]
+        lit = [grid.lit for grid in self.grids]
         albedo = [np.broadcast_to(f.material.albedo, e.shape) for f, e in zip(self.scene.fields, lit)]
         return tone.automatic_exposure(np.concatenate(lit), np.concatenate(albedo))
 

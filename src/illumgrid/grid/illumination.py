@@ -110,11 +110,31 @@ class IlluminationGrid:
         """Values (nx, ny, nz, 3), error (nx, ny, nz) and support (nx, ny, nz) of all nodes as arrays."""
         return self.values, self.error, self.support
 
+    def onto(self, spec: GridSpec) -> "IlluminationGrid":
+        """Grid on another lattice: light as `lookup` reads it, error and support those of the nearest node."""
+        points, last = spec.nodes(), np.array(self.spec.shape) - 1
+        nearest = tuple(np.clip(np.round(world_to_index(self.spec, points)), 0, last).astype(np.int64).T)
+        light = read_lattice(self.spec, self.light, points).reshape(*spec.shape, -1)
+        error, support = (array[nearest].reshape(spec.shape) for array in (self.error, self.support))
+        return IlluminationGrid(spec, light, error, support, self.channels)
+
+    @property
+    def lit(self) -> NDArray[np.float32]:
+        """Irradiance (m, 3) of the nodes that have light of their own."""
+        return np.concatenate([block.values[block.support > 0] for block in self.blocks()])
+
     @cached_property
     def mean(self) -> float:
         """Mean irradiance over RGB of the nodes that have light of their own; 0 if none has."""
-        lit = self.support > 0
-        return float(self.values[lit].mean()) if lit.any() else 0.0
+        lit = self.lit
+        return float(lit.mean()) if len(lit) else 0.0
+
+    @cached_property
+    def relative_error(self) -> float | None:
+        """Root mean square standard error of the nodes over their mean irradiance; None where none is known."""
+        known = np.isfinite(self.error) & (self.support > 0)
+        mean = float(self.values[known].mean()) if known.any() else 0.0
+        return float(np.sqrt(np.square(self.error[known], dtype=float).mean())) / mean if mean > 0 else None
 
     def _bend(self, axis: int, step: int) -> Floats:
         """Mean square over RGB of second differences along an axis, `step` nodes apart, less the noise in them."""
@@ -136,8 +156,8 @@ class IlluminationGrid:
         known = (self.support > 0) & np.isfinite(self.error)
         square = np.where(known, 8 / 27 * np.square(self.error, dtype=float), np.inf)
         for axis in range(3):
-            if self.spec.shape[axis] > 2:  # of two nodes nothing tells a curve
-                bend = np.nan_to_num(self._bend(axis, 1), neginf=0.0)  # next to a hole only the other axes tell
+            if self.spec.shape[axis] > 2:  # two nodes show no curvature
+                bend = np.nan_to_num(self._bend(axis, 1), neginf=0.0)  # next to a hole only the other axes count
                 edges = [(1, 1) if a == axis else (0, 0) for a in range(3)]
                 square += np.pad(np.maximum(bend, 0.0), edges, mode="edge") / 64
         return np.sqrt(square).astype(np.float32)

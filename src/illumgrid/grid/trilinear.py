@@ -7,7 +7,7 @@ FAR = 1e300  # as far as a coordinate can be, for one that is infinite
 
 @numba.njit(cache=True, nogil=True, error_model="numpy", _nrt=False)  # type: ignore[call-overload]
 def finite(x):
-    """A coordinate that can be reckoned with."""
+    """A coordinate that arithmetic keeps finite; 0 for NaN."""
     return min(max(x, -FAR), FAR) if x == x else 0.0
 
 

@@ -49,7 +49,7 @@ Record = dict[str, Any]  # the content of run.json
 
 @dataclass(frozen=True, eq=False)
 class Stored:
-    """What a finished folder holds, apart from the picture: one grid and one column of levels for every field.
+    """What a finished folder holds, except the picture: one grid and one column of levels for every field.
 
     The recipe says how the run was made, in what JSON has: finite numbers, text, booleans, None, lists, dicts of text.
     """
@@ -71,7 +71,7 @@ class Stored:
 
 
 def claim(folder: str | os.PathLike[str], overwrite: bool) -> None:
-    """See whether a result may be put at `folder`; changes nothing.
+    """Check that a result may be written to `folder`; changes nothing.
 
     Raises
     ------
@@ -81,7 +81,7 @@ def claim(folder: str | os.PathLike[str], overwrite: bool) -> None:
     with _sentences(f"{folder} cannot be written to", ELSEWHERE):
         place = Path(os.path.abspath(folder))
         parent = next(p for p in place.parents if os.path.lexists(p))
-        tempfile.TemporaryDirectory(dir=parent, prefix=".").cleanup()  # permissions, quota, read-only: trying tells
+        tempfile.TemporaryDirectory(dir=parent, prefix=".").cleanup()  # permissions, quota, read-only: try it
         try:
             place.lstat()
         except FileNotFoundError:
@@ -340,7 +340,7 @@ def _read_exr(path: Path, plan: Plan) -> dict[str, dict[str, Image]]:
     """Images of every part by channel, if the headers agree with the plan."""
     size = path.stat().st_size
     if sum(4 * prod(shape) * len(channels) for shape, channels in plan.values()) > DEFLATE_AT_MOST * size:
-        raise BadInput(f"its {size} bytes cannot hold the arrays that {RUN} tells of")
+        raise BadInput(f"its {size} bytes cannot hold the arrays that {RUN} describes")
     kind = OpenEXR.scanlineimage, OpenEXR.ZIP_COMPRESSION
     expected = [(name, *kind, [[0, 0], [x - 1, z * y - 1]], c) for name, ((x, y, z), c) in plan.items()]
     for pixels in (False, True):
@@ -350,7 +350,7 @@ def _read_exr(path: Path, plan: Plan) -> dict[str, dict[str, Image]]:
             window = [np.asarray(corner).tolist() for corner in h["dataWindow"]]
             found.append((h["name"], h["type"], h["compression"], window, sorted(c.name for c in h["channels"])))
         if found != expected and (pixels or found):
-            raise BadInput(f"its parts are not those that {RUN} tells of, or cannot be read")
+            raise BadInput(f"its parts are not those that {RUN} describes, or cannot be read")
     images = {part.name(): {c: image.pixels for c, image in part.channels.items()} for part in file.parts}
     if any(image.dtype != np.float32 for part in images.values() for image in part.values()):
         raise BadInput("its pixels are not float32")

@@ -20,7 +20,7 @@ SURFACES = {".glb": surface.write_glb, ".ply": surface.write_ply}
 def check(
     path: str | os.PathLike[str], isovalue: float | None = None, on: str | None = None, array: str | None = None
 ) -> None:
-    """See whether these options of `write` go together; reads and writes nothing.
+    """Check that these options of `write` go together; reads and writes nothing.
 
     Raises
     ------
@@ -79,7 +79,7 @@ def write(
     array : {"irradiance", "error", "support", "field", "color"}, optional
         Which array a `.nrrd` holds; by default the irradiance. The other formats hold all.
     progress : callable, optional
-        Told (what, done, total).
+        Called with (what, done, total).
 
     Returns
     -------

@@ -81,9 +81,8 @@ def lit(light: "Illumination", number: int, isovalue: float | None, progress: "P
 def write_glb(path: Path, surface: LitSurface) -> None:
     """Write binary glTF 2.0: linear float colours, unlit, y up; the mesh's extras say what the colours are.
 
-    trimesh writes vertex colours as bytes, in which linear light has bands in the dark, so that they go by the way it
-    has for any attribute. Positions are single precision: they are kept about the mesh's centre, and a node puts it
-    where it is in the world, turned.
+    trimesh writes vertex colours as bytes, in which dark linear light shows bands; a float attribute avoids that.
+    Positions are single precision, relative to the mesh's centre; a node of the file places and turns them.
     """
     import trimesh
 

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from illumgrid.field.volume import Volume, index_to_world
-from illumgrid.grid import GridSpec, IlluminationGrid, read_lattice
+from illumgrid.grid import GridSpec, IlluminationGrid
 
 HOLE = -1.0  # in place of an error: no light of its own, or no error known
 _STEPS = 65535
@@ -58,10 +58,7 @@ def thinned(grid: IlluminationGrid, most: int) -> IlluminationGrid:
     new = np.maximum(1, -(-old // factor))
     shape = (int(new[0]) + 1, int(new[1]) + 1, int(new[2]) + 1)
     spec = GridSpec(shape, grid.spec.origin, grid.spec.spacing * old / new, grid.spec.direction)
-    points = index_to_world(spec, np.indices(shape).reshape(3, -1).T)
-    light = read_lattice(grid.spec, grid.light, points).reshape(*shape, -1)
-    nearest = np.ix_(*(np.round(np.linspace(0, last, n)).astype(int) for last, n in zip(old, shape)))
-    return IlluminationGrid(spec, light, grid.error[nearest], grid.support[nearest], grid.channels)
+    return grid.onto(spec)
 
 
 def field_steps(values: NDArray[np.float32], limits: tuple[float, float]) -> tuple[NDArray[Any], float, float, bool]:
