@@ -23,6 +23,7 @@ WARNINGS = {
     "dicom": "a DICOM series with slices that are missing, unevenly spaced, tilted or left out",
     "choice": "a file with several arrays, of which the marked one was read",
     "plugin": "a plugin that does not load, or two that claim one name",
+    "labels": "a volume that looks like a map of labels and is lit as a field",
     "plateau": "the range holds a value on which the field is flat",
     "noise": "normals that turn from voxel to voxel, and that a blur would calm",
     "thin": "parts of the solid thinner than two nodes of the grid",

@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from illumgrid.cli.reading import Array, Channel, Crop, Downsample, Label, Spacing, Time, given
+from illumgrid.cli.reading import Array, Channel, Crop, Downsample, Label, Spacing, Time, given, labels_of
 from illumgrid.cli.terminal import Ignore, omitted_light, reported_warnings
 
 if TYPE_CHECKING:
@@ -67,16 +67,22 @@ def info(
 
 
 def _told_volume(source: str, limits: tuple[float, float] | None, inside: "Side", reading: dict[str, Any]) -> None:
-    from illumgrid.errors import tell
+    from illumgrid.errors import BadInput, tell
     from illumgrid.field.diagnosis import critical_isovalues, diagnose, plateaus
+    from illumgrid.field.labels import around_zero
     from illumgrid.field.lattice import nodes_over
     from illumgrid.field.scene import Field, suggest_range
     from illumgrid.field.volume import finite
     from illumgrid.io.readers import read_volume, volume_name
 
-    volume = finite(read_volume(source, **reading), inside)
+    labels = labels_of(reading.pop("label", None))
+    if len(labels) > 1:
+        raise BadInput(f"--label holds {len(labels)} labels; expected one for info; ask for one after another")
+    volume = finite(read_volume(source, **reading, label=labels[0] if labels else None), inside)
     _told_lattice(volume_name(source), volume)
     low, high, why = suggest_range(volume, inside)
+    if labels:
+        (low, high), why = around_zero(volume), "a voxel outside to a voxel inside the surface of the label"
     typer.echo(f"  suggested range  {low:.4g} to {high:.4g}: {why}")
     field = Field(volume_name(source), volume, range=(low, high) if limits is None else limits, inside=inside)  # type: ignore[arg-type]
     if flat := plateaus(volume):

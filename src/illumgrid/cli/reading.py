@@ -4,6 +4,8 @@ from typing import Annotated, Any
 
 import typer
 
+from illumgrid.errors import BadInput
+
 Spacing = Annotated[
     tuple[float, float, float] | None,
     typer.Option("--spacing", metavar="X Y Z", help="Distances between voxels. [default: those of the file]"),
@@ -16,7 +18,8 @@ Array = Annotated[
     str | None, typer.Option("--array", metavar="NAME", help="Which array of the file: name, or number from 0.")
 ]
 Label = Annotated[
-    int | None, typer.Option("--label", metavar="N", help="The file is a label map: light the surface of this label.")
+    str | None,
+    typer.Option("--label", metavar="N[,N…]", help="The file is a label map: smooth surfaces of these labels."),
 ]
 Crop = Annotated[
     tuple[int, int, int, int, int, int] | None,
@@ -25,6 +28,16 @@ Crop = Annotated[
 Downsample = Annotated[
     int | None, typer.Option("--downsample", min=1, metavar="N", help="Means over blocks of N x N x N voxels.")
 ]
+
+
+def labels_of(text: str | None) -> tuple[int, ...]:
+    """Labels from what was typed, such as 1,3."""
+    if text is None:
+        return ()
+    words = text.replace(",", " ").split()
+    if not words or not all(word.removeprefix("-").isdecimal() for word in words) or len(set(words)) < len(words):
+        raise BadInput(f"--label is {text!r}; expected labels that differ, whole numbers, such as 3 or 1,3")
+    return tuple(map(int, words))
 
 
 def given(**options: Any) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from illumgrid.cli.reading import Array, Channel, Crop, Downsample, Label, Spacing, Time, given
+from illumgrid.cli.reading import Array, Channel, Crop, Downsample, Label, Spacing, Time, given, labels_of
 from illumgrid.cli.terminal import Ignore, omitted_light, progress_bars, reported_warnings, say
 from illumgrid.errors import BadInput, tell
 
@@ -56,7 +56,7 @@ def _input(
     if surroundings not in (None, "sky", "floor", "box"):
         raise BadInput(f"--scene is {surroundings!r}; expected sky, floor or box")
     side: Side = "below" if inside == "below" else "above"
-    make = partial(_volume_scene, name, surroundings or "sky", albedo or (0.8, 0.8, 0.8), limits, side, reading)
+    make = partial(_volume_scene, name, surroundings or "sky", albedo, limits, side, reading)
     return Input(volume_name(name), make)
 
 
@@ -69,14 +69,21 @@ def _scene_file(name: str) -> Input:
 def _volume_scene(
     source: str, surroundings: str, albedo: Any, limits: Any, inside: "Side", reading: dict[str, Any], smooth: float
 ) -> "Scene":
+    from illumgrid.field.labels import fields_of
     from illumgrid.field.scene import Scene
     from illumgrid.field.volume import finite
     from illumgrid.field.volume import smooth as blur
     from illumgrid.io.readers import read_volume, volume_name
 
     around = {"sky": Scene.sky, "floor": Scene.floor, "box": Scene.box}[surroundings]
+    name, labels = volume_name(source), labels_of(reading.get("label"))
+    if labels:
+        each = {label: blur(read_volume(source, **{**reading, "label": label}), smooth) for label in labels}
+        fields = fields_of(name, each, albedo, limits)
+        scene = around(fields[0].volume, fields[0].material.albedo, fields[0].range, inside, name)
+        return replace(scene, fields=tuple(fields))
     volume = finite(read_volume(source, **reading), inside)
-    return around(blur(volume, smooth), albedo, limits, inside, volume_name(source))
+    return around(blur(volume, smooth), albedo or (0.8, 0.8, 0.8), limits, inside, name)
 
 
 def _smoothed(make: Callable[[], "Scene"], smooth: float) -> "Scene":

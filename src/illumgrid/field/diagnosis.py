@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from illumgrid.field.labels import labels_in
 from illumgrid.field.lattice import GridSpec
 from illumgrid.field.scene import Field
 from illumgrid.field.volume import Floats, Volume, index_to_world, interpolate, outward_normals, smooth
@@ -287,7 +288,19 @@ def _range(field: Field) -> Iterator[Finding]:
         )
 
 
+def _labels(field: Field) -> Iterator[Finding]:
+    labels = labels_in(field.volume)
+    if labels:
+        shown = ", ".join(map(str, labels[:8])) + (f", … {labels[-1]}" if len(labels) > 8 else "")
+        yield Finding(
+            "labels",
+            f"field {field.name!r} looks like a map of labels ({shown}): its level sets are the faces of voxels, and "
+            f"between two labels lie those of others; --label {labels[0]} lights a smooth surface of one, "
+            f"--label {labels[0]},{labels[-1]} several",
+        )
+
+
 def diagnose(field: Field, spec: GridSpec) -> list[Finding]:
     """All that warns of a field under its range and the grid that is meant for it."""
-    found = [*_plateau(field), *_noise(field), *_thin(field, spec), *_border(field), *_empty(field)]
+    found = [*_labels(field), *_plateau(field), *_noise(field), *_thin(field, spec), *_border(field), *_empty(field)]
     return [*found, *_anisotropy(field), *_range(field)]
