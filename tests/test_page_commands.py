@@ -34,6 +34,7 @@ def test_view_writes_a_page(call, folder, tmp_path):
         (("nowhere",), ["nowhere"]),
         (("run", "--export", "page.pdf"), ["page.pdf", ".html"]),
         (("run", "--desktop", "--no-open"), ["--desktop"]),
+        (("run", "--up", "w"), ["'w'", "-z"]),
     ],
 )
 def test_view_refuses(refuse, folder, args, words):

@@ -1,6 +1,8 @@
 """``illumgrid preview``: pictures and films of a finished run."""
 
 import math
+import shlex
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -12,6 +14,27 @@ from illumgrid.errors import BadInput
 
 if TYPE_CHECKING:
     from illumgrid.light import Illumination
+    from illumgrid.show import Camera
+
+SIZE = 960, 720
+MOST_PANELS = 32
+
+APART = {
+    "--sweep": {"--isovalue": "a sweep shows the whole range", "--isovalues": "a sweep shows the whole range"},
+    "--isovalues": {
+        "--isovalue": "one names all isovalues", "--split": "a strip has one light",
+        "--trust": "a strip has no room for the scale of error bars",
+    },
+    "--grid-volume": dict.fromkeys(
+        ("--sweep", "--isovalue", "--isovalues", "--local", "--trust", "--split", "--scale-bar"),
+        "the grid has no isovalue and one light",
+    ),
+    "--trust": {"--local": "error bars are those of global light", "--split": "error bars are those of global light",
+                "--exposure": "error bars are not light"},
+    "--split": {"--local": "--split shows local light on the left"},
+    "--camera": dict.fromkeys(("--view", "--zoom", "--up", "--roll"), "the camera of the picture says all of that"),
+}  # fmt: skip
+"""Options that do not go together, and why."""
 
 
 def preview(
@@ -25,22 +48,29 @@ def preview(
         ),
     ] = None,
     field: Annotated[
-        str | None, typer.Option(metavar="NAME", help="Field that --isovalue belongs to. [default: the first]")
+        str | None, typer.Option(metavar="NAME", help="Field that the isovalue belongs to. [default: the first]")
     ] = None,
     isovalue: Annotated[
         float | None, typer.Option(metavar="C", help="Isovalue to show. [default: the middle of the range]")
     ] = None,
-    local: Annotated[
-        bool, typer.Option("--local", help="A lamp at the camera in place of the computed light.")
-    ] = False,
+    isovalues: Annotated[
+        str | None,
+        typer.Option(metavar="C,C,...", help="Several isovalues side by side in one picture, seen by one camera."),
+    ] = None,
+    local: Annotated[bool, typer.Option("--local", help="A lamp at the camera instead of the computed light.")] = False,
     trust: Annotated[
-        bool, typer.Option("--trust", help="In place of light, how sure it is: its relative error bar, and the holes.")
+        bool, typer.Option("--trust", help="Relative error bars instead of light, with holes hatched.")
     ] = False,
-    split: Annotated[bool, typer.Option("--split", help="Both side by side: local left, global right.")] = False,
+    split: Annotated[bool, typer.Option("--split", help="Local light left, global light right.")] = False,
+    exposure: Annotated[
+        float, typer.Option(metavar="EV", help="Brighten (or darken, below 0) by this many stops.")
+    ] = 0.0,
     grid_volume: Annotated[
         bool, typer.Option("--grid-volume", help="The illumination grid itself, as a block.")
     ] = False,
-    cut: Annotated[bool, typer.Option("--cut", help="With --grid-volume: cut a corner out, to look inside.")] = False,
+    cut: Annotated[
+        bool, typer.Option("--cut", help="With --grid-volume: cut out the corner nearest to the eye.")
+    ] = False,
     view: Annotated[
         str | None,
         typer.Option(
@@ -48,50 +78,79 @@ def preview(
             help="front, back, left, right, top, bottom, iso, or azimuth,elevation in degrees. [default: 30,18]",
         ),
     ] = None,
-    zoom: Annotated[float, typer.Option(metavar="Z", help="2 shows the middle twice as large.")] = 1.0,
-    size: Annotated[tuple[int, int], typer.Option(metavar="W H", help="Pixels.")] = (960, 720),
-    background: Annotated[
-        str | None, typer.Option(metavar="COLOR", help="As CSS writes it: white, #202030. [default: a dark grey]")
+    zoom: Annotated[float, typer.Option(metavar="Z", help="Magnification: 2 shows the middle twice as large.")] = 1.0,
+    up: Annotated[
+        str | None,
+        typer.Option(metavar="AXIS", help="World axis that points up: x, y, z, -x, -y, -z. [default: z, see docs]"),
     ] = None,
-    engine: Annotated[str, typer.Option(help="What draws: auto, egl, osmesa, software.")] = "auto",
+    roll: Annotated[float, typer.Option(metavar="DEG", help="Turn the picture clockwise.")] = 0.0,
+    camera: Annotated[
+        Path | None, typer.Option(metavar="PNG", help="Use the camera of this picture, which preview wrote.")
+    ] = None,
+    size: Annotated[
+        tuple[int, int], typer.Option(metavar="W H", help="Pixels of the picture, or of each panel.")
+    ] = SIZE,
+    scale_bar: Annotated[
+        bool, typer.Option("--scale-bar", help="A bar of known length, at the depth of the middle of the object.")
+    ] = False,
+    background: Annotated[
+        str | None,
+        typer.Option(metavar="COLOR", help="CSS colour: white, #202030, transparent. [default: a dark grey]"),
+    ] = None,
+    engine: Annotated[str, typer.Option(help="Rendering engine: auto, egl, osmesa, software.")] = "auto",
 ) -> None:
-    """Draw one isosurface of a finished run, or a sweep through many."""
-    from illumgrid import show as pictures
+    """Draw an isosurface of a finished run, several side by side, or a sweep through the range."""
+    from illumgrid import show
     from illumgrid.chain import load
     from illumgrid.io import store
 
-    _check(output, sweep, isovalue, local, trust, split, grid_volume, cut)
-    drawn_by, why = pictures.choose_engine(engine)
+    given = {
+        "--sweep": sweep is not None, "--isovalue": isovalue is not None, "--isovalues": isovalues is not None,
+        "--local": local, "--trust": trust, "--split": split, "--grid-volume": grid_volume, "--scale-bar": scale_bar,
+        "--exposure": exposure != 0, "--view": view is not None, "--zoom": zoom != 1, "--up": up is not None,
+        "--roll": roll != 0, "--camera": camera is not None,
+    }  # fmt: skip
+    _check(given, output, sweep, isovalue, cut, background)
+    several = None if isovalues is None else _numbers(isovalues)
+    engine_used, why = show.choose_engine(engine)
     light = load(folder)
-    options: dict[str, Any] = {"view": view, "zoom": zoom, "background": background, "engine": drawn_by, "trust": trust}
-    if size != (960, 720):
+    options: dict[str, Any] = {"background": background, "engine": engine_used, "stops": exposure}
+    if size != SIZE:
         options |= {"width": size[0], "height": size[1]}
-    if sweep is not None:
-        _sweep(light, field, sweep, local, split, options)
-        wrote = f"wrote {sweep[1]}, {sweep[0]} isovalues"
+    look: dict[str, Any] = {"view": view, "zoom": zoom, "up": up, "roll": roll}
+    seen_by = None if camera is None else _camera_in(camera)
+    if grid_volume:
+        picture = show.grid_volume(light, field, cut=cut, camera=seen_by, **options, **look)
+        store.write_file(_given(output), show.png(picture, _about(seen_by)))
     else:
-        assert output is not None
-        if grid_volume:
-            del options["trust"]
-            picture = pictures.grid_volume(light, field, cut=cut, **options)
+        asked = several or ([] if isovalue is None else [isovalue])
+        _note_outside(light, field, asked)
+        seen_by = seen_by or _fitted(light, field, asked, sweep is not None, options, look)
+        options |= {"trust": trust, "bar": scale_bar, "camera": seen_by}
+        if sweep is not None:
+            _film(light, field, sweep, _drawn(light, field, local, split, options), seen_by)
+        elif several:
+            picture = show.strip(light, several, field, local=local, **options)
+            store.write_file(_given(output), show.png(picture, _about(seen_by)))
         else:
-            _told_outside(light, field, isovalue)
+            if trust and camera is None:  # the scale below leaves the picture another aspect
+                options |= look | {"camera": None}
             picture = _drawn(light, field, local, split, options)(isovalue)
-        store.write_file(output, pictures.png(picture))
-        wrote = f"wrote {output}"
+            store.write_file(_given(output), show.png(picture, _about(seen_by)))
     if trust:
         from illumgrid.show.trust import doubts
 
         for doubt in doubts(light):
             say(f"note: {doubt}")
-    say(wrote + ("" if local or trust else f" at exposure {light.exposure:.4g}"))
+    wrote = f"wrote {output}" if sweep is None else f"wrote {sweep[1]}, {sweep[0]} isovalues"
+    say(wrote + ("" if local or trust else f" at exposure {light.exposure * 2**exposure:.4g}"))
     if engine == "auto":
-        say(f"drawn by the engine {drawn_by}: {why}")
+        say(f"drawn by the engine {engine_used}: {why}")
 
 
 def _check(
-    output: Path | None, sweep: tuple[int, Path] | None, isovalue: float | None, local: bool, trust: bool,
-    split: bool, grid_volume: bool, cut: bool,
+    given: dict[str, bool], output: Path | None, sweep: tuple[int, Path] | None, isovalue: float | None, cut: bool,
+    background: str | None,
 ) -> None:  # fmt: skip
     """Refuse options that do not go together, or are out of range, before anything is read."""
     if (output is None) == (sweep is None):
@@ -101,20 +160,13 @@ def _check(
         raise BadInput(f"--output is {output.name!r}; expected a file name that ends in .png")
     if isovalue is not None and not math.isfinite(isovalue):
         raise BadInput(f"--isovalue is {isovalue}; expected a finite number")
-    alone = {"--sweep": sweep is not None, "--isovalue": isovalue is not None, "--local": local, "--trust": trust,
-             "--split": split}  # fmt: skip
-    if grid_volume and any(alone.values()):
-        raise BadInput(f"{next(o for o in alone if alone[o])} came with --grid-volume, which has no isovalue and one "
-                       "light; leave one of the two out")  # fmt: skip
-    if cut and not grid_volume:
+    for one, others in APART.items():
+        for other, why in others.items():
+            if given[one] and given[other]:
+                raise BadInput(f"{other} came with {one}; expected one of the two: {why}")
+    if cut and not given["--grid-volume"]:
         raise BadInput("--cut came without --grid-volume; expected both, or neither")
-    if trust and (local or split):
-        raise BadInput(f"--trust came with {'--local' if local else '--split'}; expected one: bars are of global light")
-    if local and split:
-        raise BadInput("--local and --split came together; expected one: --split shows the local light on its left")
     if sweep is not None:
-        if isovalue is not None:
-            raise BadInput("--isovalue came with --sweep, which shows the whole range; leave one of the two out")
         if not 2 <= sweep[0] <= 10000:
             raise BadInput(f"--sweep got {sweep[0]} isovalues; expected 2 to 10000")
         from illumgrid.show.film import check_ending
@@ -122,14 +174,77 @@ def _check(
         check_ending(sweep[1].name, sweep[1].suffix.lower())
         if sweep[1].suffix and sweep[1].is_dir():
             raise BadInput(f"{sweep[1]} is a folder; expected the name of a file")
+        if sweep[1].suffix and background == "transparent":
+            raise BadInput(
+                "--background is transparent; expected a colour for a film, or a folder of PNG to sweep into"
+            )
 
 
-def _told_outside(light: "Illumination", field: str | None, isovalue: float | None) -> None:
-    number = light.scene.number_of(field)
-    if isovalue is not None:
-        low, high = light.scene.fields[number].range
+def _numbers(text: str) -> list[float]:
+    """Isovalues from a list with commas."""
+    try:
+        numbers = [float(part) for part in text.split(",")]
+    except ValueError:
+        numbers = []
+    if not 2 <= len(numbers) <= MOST_PANELS or not all(map(math.isfinite, numbers)):
+        raise BadInput(
+            f"--isovalues is {text[:60]!r}; expected 2 to {MOST_PANELS} numbers with commas, such as 20,40,80"
+        )
+    return numbers
+
+
+def _given(output: Path | None) -> Path:
+    assert output is not None  # _check has seen to it
+    return output
+
+
+def _camera_in(file: Path) -> "Camera":
+    """The camera that a picture was taken by, from its text."""
+    from PIL import Image, UnidentifiedImageError
+
+    from illumgrid.show.camera import camera_of
+
+    try:
+        with Image.open(file) as picture:
+            text = picture.info.get("Camera")
+    except UnidentifiedImageError:
+        text = None
+    if not isinstance(text, str):
+        raise BadInput(f"{file} holds no camera; expected a picture that 'illumgrid preview' wrote")
+    return camera_of(text)
+
+
+def _about(camera: "Camera | None") -> dict[str, str]:
+    """What the text of a PNG says: the command, and the camera."""
+    from illumgrid.show.camera import camera_text
+
+    about = {"Command": shlex.join(["illumgrid", *sys.argv[1:]])}
+    return about if camera is None else about | {"Camera": camera_text(camera)}
+
+
+def _note_outside(light: "Illumination", field: str | None, isovalues: list[float]) -> None:
+    low, high = light.scene.fields[light.scene.number_of(field)].range
+    for isovalue in isovalues:
         if not low <= isovalue <= high:
             say(f"note: the isovalue {isovalue:g} lies outside the range {low:g} to {high:g} of the light")
+
+
+def _fitted(
+    light: "Illumination", field: str | None, isovalues: list[float], sweep: bool,
+    options: dict[str, Any], look: dict[str, Any],
+) -> "Camera":  # fmt: skip
+    """The camera that holds everything that will be drawn."""
+    from illumgrid.show import fit_camera, render, widest_row
+
+    scene = light.scene
+    if sweep:
+        rows = widest_row(scene)
+    elif isovalues:
+        rows = scene.levels_through(scene.number_of(field), isovalues)
+    else:
+        rows = scene.levels(0.5)
+    width, height = (options.get(side, (render.__kwdefaults__ or {})[side]) for side in ("width", "height"))
+    return fit_camera(scene, rows, max(width, 1) / max(height, 1), **look)
 
 
 def _drawn(
@@ -147,26 +262,25 @@ def _drawn(
     return draw
 
 
-def _sweep(
-    light: "Illumination", field: str | None, sweep: tuple[int, Path], local: bool, split: bool, options: dict[str, Any]
-) -> None:
+def _film(
+    light: "Illumination", field: str | None, sweep: tuple[int, Path], draw: Callable[[float | None], Any],
+    camera: "Camera",
+) -> None:  # fmt: skip
     from illumgrid.io import store
-    from illumgrid.show import fit_camera, png, render, widest_row
+    from illumgrid.show import png
     from illumgrid.show.film import film, frames
 
     count, path = sweep
-    width, height = (options.get(side, (render.__kwdefaults__ or {})[side]) for side in ("width", "height"))
-    view, zoom = options.pop("view"), options.pop("zoom")
-    options["camera"] = fit_camera(light.scene, widest_row(light.scene), width / height, view, zoom)
-    draw = _drawn(light, field, local, split, options)
     with progress_bars() as progress:
 
-        def told() -> Iterator[Any]:
+        def reported() -> Iterator[Any]:
             for number, picture in enumerate(frames(light, field, count, draw), 1):
                 progress("draw", number, count)
                 yield picture
 
         if path.suffix:
-            store.write_file(path, film(list(told()), path.suffix.lower()))
+            store.write_file(path, film(list(reported()), path.suffix.lower()))
         else:
-            store.write_folder(path, ((f"{number:04}.png", png(picture)) for number, picture in enumerate(told())))
+            about = _about(camera)
+            pictures = ((f"{number:04}.png", png(picture, about)) for number, picture in enumerate(reported()))
+            store.write_folder(path, pictures)

@@ -1,4 +1,4 @@
-"""``illumgrid view``: sweep the isovalue of a finished run by hand."""
+"""``illumgrid view``: sweep the isovalue of a finished run interactively."""
 
 from contextlib import suppress
 from pathlib import Path
@@ -15,19 +15,23 @@ def view(
     export: Annotated[
         Path | None, typer.Option("--export", metavar="HTML", help="Write the page as one file instead of serving it.")
     ] = None,
-    no_open: Annotated[bool, typer.Option("--no-open", help="Print the page's address; open no browser.")] = False,
+    no_open: Annotated[bool, typer.Option("--no-open", help="Print the address of the page; open no browser.")] = False,
     desktop: Annotated[
-        bool, typer.Option("--desktop", help="A window of PyVista instead of a page: each isovalue is extracted anew.")
+        bool, typer.Option("--desktop", help="A PyVista window instead of a page; extracts each isosurface anew.")
     ] = False,
+    up: Annotated[
+        str | None,
+        typer.Option(metavar="AXIS", help="World axis that points up: x, y, z, -x, -y, -z. [default: z, see docs]"),
+    ] = None,
 ) -> None:
-    """Sweep the isovalue by hand: in the browser, in a file to mail, or in a window."""
+    """Sweep the isovalue interactively: in the browser, in a file to send, or in a window."""
     from illumgrid.chain import load
     from illumgrid.io import store
 
     if export is not None and export.suffix.lower() not in (".html", ".htm"):
         raise BadInput(f"--export is {export.name!r}; expected a file name that ends in .html")
-    if desktop and (export is not None or no_open):
-        raise BadInput("--desktop came with --export or --no-open; expected one of the three")
+    if desktop and (export is not None or no_open or up is not None):
+        raise BadInput("--desktop came with --export, --no-open or --up; expected it alone")
     light = load(folder)
     if desktop:
         from illumgrid.show.viewer.desktop import show
@@ -36,15 +40,15 @@ def view(
         return
     from illumgrid.show.viewer import page
 
-    text = page(light).encode()
+    text = page(light, up).encode()
     if export is not None:
         store.write_file(export, text)
-        say(f"wrote {export}, {len(text) / 1e6:.1f} MB: open it in any browser, or mail it")
+        say(f"wrote {export}, {len(text) / 1e6:.1f} MB: open it in any browser")
         return
     from illumgrid.show.viewer.server import serve
 
     with serve(text) as server:
-        say(f"serving {server.address} to this machine only; Ctrl-C ends it")
+        say(f"serving {server.address} to this machine only; stop with Ctrl-C")
         if not no_open:
             import webbrowser
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from illumgrid.errors import BadInput
 from illumgrid.field.levelset import turned, upward
-from illumgrid.field.scene import Scene
+from illumgrid.field.scene import Scene, suggest_range
 from illumgrid.field.volume import Floats, box_corners, index_to_world
 
 HALF_ANGLE = 0.27  # tangent of half the vertical angle of view, 30 degrees in all
@@ -90,26 +90,27 @@ def axes_of(direction: Floats, up: str = "z") -> tuple[Floats, Floats, Floats]:
     return np.cross(upward_axis, front), front, upward_axis
 
 
-FLAT, ROUND = 0.2, 0.05  # area of an end over the largest section: a flat cut, a rounded end
+FLAT, ROUND = 0.3, 0.05  # area of an end over the largest section: a flat cut, a rounded end
 
 
 def up_of(scene: Scene) -> str:
     """The default up: world +z, or -z for an object that would stand on its head.
 
     Only an array without orientation (identity axes at the origin: its file states none) in a scene without walls is
-    turned over, and only if the solid ends in a flat cut on top and is rounded below: a bust stands on its neck.
+    turned over, and only if the object, as Otsu's threshold finds it, ends in a flat cut on top and is rounded below: a
+    bust stands on its neck.
     """
-    volume = scene.fields[0].volume
-    stated = (volume.direction != np.eye(3)).any() or volume.origin.any()
+    first = scene.fields[0]
+    stated = (first.volume.direction != np.eye(3)).any() or first.volume.origin.any()
     if stated or scene.quads or len(scene.fields) > 1:
         return "z"
-    solid = scene.fields[0].solid(volume.values, widest_row(scene)[0])
-    areas = solid.sum(axis=(0, 1))
-    filled = areas[areas > 0]
-    if len(filled) < 2:
+    try:
+        low, high, _ = suggest_range(first.volume, first.inside)
+    except BadInput:  # constant
         return "z"
-    below, above = filled[[0, -1]] / filled.max()
-    return "-z" if above > FLAT and below < ROUND else "z"
+    areas = first.solid(first.volume.values, low if first.upward > 0 else high).sum(axis=(0, 1))
+    ends = areas[areas > 0][[0, -1]] / areas.max()
+    return "-z" if ends[1] > FLAT and ends[0] < ROUND else "z"
 
 
 def angles(view: str | tuple[float, float]) -> tuple[float, float]:
@@ -200,7 +201,7 @@ def fit_camera(
         Degrees by which the picture is turned clockwise.
     """
     outline = np.concatenate([outline_of(scene, one) for one in np.atleast_2d(row)])
-    axes = axes_of(scene.fields[0].volume.direction, up or up_of(scene))
+    axes = axes_of(scene.fields[0].volume.direction, up_of(scene) if up is None else up)
     if view is None:
         extent = np.ptp(outline @ np.stack(axes, axis=1), axis=0)
         flat, closed = extent[2] < 0.5 * extent[:2].min(), not scene.background.any()

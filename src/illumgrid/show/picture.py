@@ -203,7 +203,7 @@ def grid_volume(
     number = light.scene.number_of(field)
     spec = light.grids[number].spec
     if camera is None:
-        axes = axes_of(spec.direction, up or up_of(light.scene))
+        axes = axes_of(spec.direction, up_of(light.scene) if up is None else up)
         camera = camera_around(box_corners(spec), axes, width / height, view or (30.0, 24.0), zoom, roll)
     block = Block(_shown(light, field, None, False, False, stops), number, camera.eye, cut)
     if sheet.engine == "software":

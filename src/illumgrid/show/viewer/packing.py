@@ -140,7 +140,7 @@ def _opening(scene: Scene, stage: Stage, up: str | None) -> dict[str, Any]:
     from scipy.spatial import ConvexHull, QhullError
 
     row = scene.levels(0.5)[0]
-    right, front, upright = axes_of(scene.fields[0].volume.direction, up or up_of(scene))
+    right, front, upright = axes_of(scene.fields[0].volume.direction, up_of(scene) if up is None else up)
     forward = fit_camera(scene, row, 1.0, up=up).forward
     points = stage.place(outline_of(scene, row))
     try:
@@ -172,7 +172,9 @@ def packed(light: Illumination, up: str | None = None) -> tuple[dict[str, Any], 
         "title": ", ".join(f.name for f in scene.fields),
         "subtitle": f"Global light from an illumination grid; {several}.",
         "notes": [*notes, *(f"Error bars: {doubt}." for doubt in trust.doubts(light))],
-        "axes": [axis.tolist() for axis in axes_of(scene.fields[0].volume.direction, up or up_of(scene))],
+        "axes": [
+            axis.tolist() for axis in axes_of(scene.fields[0].volume.direction, up_of(scene) if up is None else up)
+        ],
         "tangent": HALF_ANGLE,
         "opening": _opening(scene, stage, up),
         "background": BACKGROUND,
