@@ -1,6 +1,7 @@
 """Channels of light: light is linear, so grids and samples carry as many as a scene needs, and mix them to RGB."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -54,8 +55,8 @@ def channels_for(count: int) -> Channels:
     return GREY if count == 1 else RGB
 
 
-def kept(light: ArrayLike, channels: Channels | None = None) -> tuple[NDArray[np.float32], Channels]:
-    """Light as it is stored, (..., C) contiguous read-only float32, and its channels, by default by their count.
+def kept(light: ArrayLike, channels: Channels | None = None) -> dict[str, Any]:
+    """Attributes of a holder of light (..., C): `light`, its `channels` (by default by their count), `values` in RGB.
 
     Raises
     ------
@@ -70,5 +71,6 @@ def kept(light: ArrayLike, channels: Channels | None = None) -> tuple[NDArray[np
     if len(channels) != count:
         raise BadInput(f"light of {count} channels came; expected {len(channels)}: {', '.join(channels.names)}")
     stored = np.ascontiguousarray(array).view()
-    stored.flags.writeable = False
-    return stored, channels
+    values = channels.rgb(stored).view()
+    stored.flags.writeable = values.flags.writeable = False
+    return {"light": stored, "channels": channels, "values": values}

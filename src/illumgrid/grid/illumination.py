@@ -61,14 +61,11 @@ class IlluminationGrid:
         if np.shape(self.values)[:-1] != shape:
             expected = f"{(*shape, 3)} (RGB), {(*shape, 1)} (grey) or as many channels as are named"
             raise BadInput(f"the values of a grid have shape {np.shape(self.values)}; expected {expected}")
-        light, channels = kept(self.values, self.channels)
         arrays = {name: np.ascontiguousarray(getattr(self, name), dtype=np.float32) for name in ("error", "support")}
         for name, array in arrays.items():
             if array.shape != shape:
                 raise BadInput(f"the {name} of a grid has shape {array.shape}; expected {shape}")
-        values = channels.rgb(light).view()
-        values.flags.writeable = False
-        for name, value in (arrays | {"light": light, "channels": channels, "values": values}).items():
+        for name, value in (arrays | kept(self.values, self.channels)).items():
             object.__setattr__(self, name, value)
 
     def lookup(self, points: ArrayLike) -> NDArray[np.float32]:

@@ -29,10 +29,7 @@ class WallTexture:
     light: NDArray[np.float32] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        light, channels = kept(self.values, self.channels)
-        values = channels.rgb(light).view()
-        values.flags.writeable = False
-        for name, value in {"light": light, "channels": channels, "values": values}.items():
+        for name, value in kept(self.values, self.channels).items():
             object.__setattr__(self, name, value)
 
     def lookup(self, u: ArrayLike, v: ArrayLike, t: ArrayLike) -> NDArray[np.float32]:
