@@ -3,9 +3,12 @@
 import numpy as np
 import pytest
 
-from illumgrid import cli
+from illumgrid import chain, cli
 from illumgrid import show as preview
 from shapes import ball
+
+# A judgement takes longer than the runs of most tests: those that are about it ask for it. The command line judges.
+chain.run.__kwdefaults__["judge"] = False
 
 
 @pytest.fixture

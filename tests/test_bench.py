@@ -3,54 +3,67 @@
 import csv
 import json
 import warnings
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from types import SimpleNamespace
+from typing import ClassVar
 
 import numpy as np
 import pytest
 
-from illumgrid.accuracy.chart import _remarks, _show_default, _thinned, bench, chart, told
+from illumgrid import registry
+from illumgrid import run as run_chain
+from illumgrid.accuracy.chart import _references, _remarks, _show_default, _thinned, _tracer_of, bench, report
 from illumgrid.accuracy.chart import sizes as sizes_of
-from illumgrid.accuracy.chart.contestants import COUNTS, Way, ways
+from illumgrid.accuracy.chart.methods import COUNTS, Method, methods, tracers
 from illumgrid.accuracy.chart.race import Point, Race, Run, covered, front
-from illumgrid.accuracy.chart.whence import Bar
-from illumgrid.accuracy.parts import Split
-from illumgrid.accuracy.probe import Pace
-from illumgrid.accuracy.truth import Truth, begin, errors, unseen_on_level_sets
+from illumgrid.accuracy.cost import Pace
+from illumgrid.accuracy.points import unseen_on_level_sets
+from illumgrid.accuracy.reference import begin, errors
 from illumgrid.backends.numba_ import Numba
-from illumgrid.field.scene import Scene
+from illumgrid.cli.bench import table
+from illumgrid.field.scene import Field, Scene
+from illumgrid.field.volume import world_to_index
 from illumgrid.interpolators.nearest import Nearest
 from illumgrid.interpolators.rbf import Rbf
 from illumgrid.interpolators.splat import Splat
 from illumgrid.samplers.direct import Direct
 from illumgrid.samplers.uniform import Uniform
+from illumgrid.show import chart
+from illumgrid.transport.samples import Samples
+from illumgrid.transport.stages import capabilities
+from illumgrid.transport.tracer import prepare
 from shapes import ball, refused, sky
 
 BACKEND = Numba()
-WAY = Way(Direct(), BACKEND, "levelset", (Nearest(),))
+SCENE = Scene.floor(ball(14), range=(0.4, 0.9))
+TRACER = prepare(BACKEND, SCENE)
 
 
-def scene_of(n=14):
-    return Scene.floor(ball(n), range=(0.4, 0.9))
+def method(sampler, denser=None):
+    return Method(sampler, BACKEND, TRACER, "levelset", (Nearest(),), denser)
+
+
+METHOD = method(Direct())
 
 
 @pytest.fixture(scope="module")
 def truth():
-    scene = scene_of()
-    return scene, begin(scene, BACKEND, unseen_on_level_sets(scene, 8, 200, 0), 8, 0, 256)
+    return SCENE, begin(TRACER, unseen_on_level_sets(SCENE, 8, 200, 0), 8, 0, 256)
 
 
-def point(truth, seconds, off, grid=8, paths=4, way=WAY, seeds=3):
-    made = Point(way, way.interpolators[0], grid, paths, 100, np.ones(len(truth), bool))
+def point(truth, seconds, off, grid=8, paths=4, way=METHOD, seeds=3):
+    made = Point(way, way.interpolators[0], grid, paths, 100, np.ones(len(truth), bool), grid)
     made.seconds = [seconds] * seeds
     made.light = [truth.light + np.hypot(off, truth.error) * truth.mean] * seeds
     return made
 
 
-def split_of(noise, grid=0.0):
-    return Split(noise**2, grid**2, 0.0, 1e-6, 0.0, 1e-6)
+def parts_of(nodes, paths, noise, grid=0.0):
+    parts = {"noise": noise**2, "grid": grid**2, "uncovered": 0.0, "bounces": 1e-6}
+    return {"nodes": nodes, "paths": paths, **parts, "cross": 0.0, "uncertain": 1e-6, "total": sum(parts.values())}
 
 
-BARS = (Bar(8, 16, split_of(0.05, 0.02)), Bar(8, 64, split_of(0.01, 0.02)), Bar(16, 16, split_of(0.04)))
+PARTS = parts_of(8, 16, 0.05, 0.02), parts_of(8, 64, 0.01, 0.02), parts_of(16, 16, 0.04)
 
 
 def test_the_front_is_what_nobody_beats(truth):
@@ -67,27 +80,24 @@ def test_the_errors_of_a_point_have_the_truths_variance_subtracted(truth):
 
 def test_a_race_goes_from_cheap_to_dear_and_keeps_its_seeds(truth):
     scene, exact = truth
-    denser = Way(Uniform(32), BACKEND, "levelset", (Nearest(),))
-    race = Race(
-        scene, {"levelset": exact}, [WAY, Way(Uniform(8), BACKEND, "levelset", (Nearest(),), denser)], [4, 7], 3, 0
-    )
-    while lane := race.next(np.inf):
-        race.step(lane)
+    race = Race(scene, {"levelset": exact}, [METHOD, method(Uniform(8), method(Uniform(32)))], [4, 7], 3, 0)
+    while contestant := race.next(np.inf):
+        race.advance(contestant)
         assert len(race.points) < 60
     ways = {"direct, numba (levelset), nearest", "uniform 8, numba (levelset), nearest"}
     assert {p.label for p in race.points} >= ways
-    assert {p.grid for p in race.points if p.way is WAY} == {4, 7}
+    assert {p.grid for p in race.points if p.method is METHOD} == {4, 7}
     for p in race.points:
         assert len(p.light) == 1 and p.light[0].shape == (len(exact), 3) and p.seconds[0] > 0
     race.repeat(np.inf, lambda: None)
-    best = front(race.points, race.truths)
+    best = front(race.points, race.references)
     assert all(len(p.seconds) == 3 for p in best)
     assert all(not np.array_equal(p.light[0], p.light[1]) for p in best if p.rmse(exact) > 1e-3)
 
 
 def test_a_run_that_goes_on_is_the_run_with_more_paths(truth):
     scene, _ = truth
-    halting, straight = Run(scene, WAY, 7, 3, 5), Run(scene, WAY, 7, 3, 5)
+    halting, straight = Run(scene, METHOD, 7, 3, 5), Run(scene, METHOD, 7, 3, 5)
     for paths in (4, 16, 64):
         halting.go_on(paths)
     straight.go_on(64)
@@ -97,46 +107,52 @@ def test_a_run_that_goes_on_is_the_run_with_more_paths(truth):
 
 def test_covered_points_read_only_nodes_with_light(truth):
     scene, exact = truth
-    run = Run(scene, WAY, 9, 1, 0)
+    run = Run(scene, METHOD, 9, 1, 0)
     run.go_on(4)
     (grid,), _ = run.fill(Nearest())
-    asked = exact.queries
-    assert covered([replace(grid, support=np.ones_like(grid.support))], asked).all()
-    assert not covered([replace(grid, support=np.zeros_like(grid.support))], asked).any()
+    asked, random = exact.queries, np.random.default_rng(0)
+    support = (random.random(grid.support.shape) < 0.9).astype(np.float32)
+    index = world_to_index(grid.spec, asked.point)
+    cell = np.floor(index).astype(int)
+    expected = [all(support[tuple(low + corner)] for corner in np.ndindex(2, 2, 2)) for low in cell]
+    assert 0.2 < np.mean(expected) < 0.8 and (index - cell).min() > 1e-4  # no point for which a corner counts nothing
+    np.testing.assert_array_equal(covered([replace(grid, support=support)], asked), expected)
 
 
 def test_everything_that_is_registered_takes_part_or_is_told(truth):
     scene, exact = truth
-    entrants, notes = ways(scene, exact.queries, 1e6)
-    names = {(w.sampler.name, w.backend.name) for w in entrants}
+    entrants, notes = tracers(scene, exact.queries, 1e6)
+    ways = methods(entrants)
+    names = {(w.sampler.name, w.backend.name) for w in ways}
     assert {("direct", "numba"), ("uniform", "numba"), ("direct", "reference")} <= names
-    chain = next(w for w in entrants if w.sampler.name == "uniform")
+    chain = next(w for w in ways if w.sampler.name == "uniform")
     assert chain.sampler.count == COUNTS[0] and chain.denser.sampler.count == COUNTS[1]
-    few, notes = ways(scene, exact.queries, 1e-6)
+    few, notes = tracers(scene, exact.queries, 1e-6)
     assert {w.backend.name for w in few} == {"numba"}  # the fastest is never too slow
-    assert any("reference takes no part: 64 queries" in note for note in notes)
+    assert any("reference does not compete: 64 queries" in note for note in notes)
 
 
 def test_the_advice_names_the_fastest_that_is_good_enough_and_what_is_missing(truth):
     _, exact = truth
     truths = {"levelset": exact}
     points = [point(exact, 1, 0.09, 8, 16), point(exact, 4, 0.025, 8, 64)]
-    records = [told.record(p, truths, True) for p in points]
-    said = told.advice(records, BARS, 5)
+    records = [report.record(p, truths, True) for p in points]
+    said = report.advice(records, PARTS, 5)
     assert said[0].startswith("for 3% use --sampler direct --backend numba --interpolator nearest --grid 8 --paths 64")
     assert said[1].startswith("for 10% use") and "--paths 16 --bounces 5 (1 s, error 9.00%)" in said[1]
-    assert "1% was not reached" in said[2] and "the grid's: more nodes" in said[2]
-    assert "noise: more paths" in told.advice(records[:1], BARS, 5)[-1]
-    paper = told.record(point(exact, 1, 0.2, way=Way(Uniform(8), BACKEND, "levelset", (Nearest(),))), truths, False)
-    assert "--isovalues 8 " in told.options(paper, 4)
-    table = told.table([*records, paper])
-    assert table.index("the front:") < table.index("direct") < table.index("the best of the others:")
+    assert "1% was not reached" in said[2] and "interpolation between nodes; increase --grid" in said[2]
+    assert "noise; increase --paths" in report.advice(records[:1], PARTS, 5)[-1]
+    paper = report.record(point(exact, 1, 0.2, way=method(Uniform(8))), truths, False)
+    assert "--isovalues 8 " in report.options(paper, 4)
+    text = table([*records, paper])
+    assert text.index("the front:") < text.index("direct") < text.index("the best of the others:")
 
 
 def test_remarks_tell_a_blunt_truth_and_missing_seeds(truth):
     _, exact = truth
     one, other = exact.halves
-    blunt = Truth((one, replace(other, mean=other.mean + 1)), 8)
+    answer = replace(other.samples, mean=other.samples.mean + 1)
+    blunt = replace(exact, halves=(one, replace(other, answers=(answer,))))
     said = _remarks((point(blunt, 1, 0.01, seeds=1),), {"levelset": blunt})
     assert "more than a fifth" in said[0] and "fewer than 3 seeds" in said[1]
     assert not _remarks((point(exact, 1, 0.5),), {"levelset": exact})
@@ -145,17 +161,16 @@ def test_remarks_tell_a_blunt_truth_and_missing_seeds(truth):
 def test_the_chart_can_be_drawn_of_one_point_and_of_many(truth):
     _, exact = truth
     records = [
-        told.record(point(exact, s, 0.1 / s, seeds=k), {"levelset": exact}, s < 3) for s, k in ((1, 3), (2, 1), (3, 1))
+        report.record(point(exact, s, 0.1 / s, seeds=k), {"levelset": exact}, s < 3)
+        for s, k in ((1, 3), (2, 1), (3, 1))
     ]
     for some in (records[:1], records):
-        figure = chart.draw(some, BARS, "a ball")
+        figure = chart.draw(some, PARTS, "a ball")
         left, right = figure.axes
         assert left.get_xscale() == left.get_yscale() == "log" and "seconds" in left.get_xlabel()
         assert "direct, numba (levelset), nearest" in [t.get_text() for t in figure.legends[0].get_texts()]
         heights = [sum(bars[k].get_height() for bars in right.containers if hasattr(bars, "patches")) for k in range(3)]
-        np.testing.assert_allclose(
-            heights, [100 * np.sqrt(sum(vars(b.split).values()) - 1e-6) for b in BARS], rtol=1e-3
-        )
+        np.testing.assert_allclose(heights, [100 * np.sqrt(p["total"]) for p in PARTS], rtol=1e-3)
     assert chart.image(figure, "png").startswith(b"\x89PNG") and b"<svg" in chart.image(figure, "svg")
 
 
@@ -168,7 +183,7 @@ def test_a_budget_or_a_scene_that_cannot_be_is_refused():
 
 
 def test_bench_writes_what_it_says_whole_and_once(call, tmp_path):
-    arguments = ("bench", "v.npy", "--range", 0.3, 0.9, "--budget", 4, "-o", "b")
+    arguments = ("bench", "v.npy", "--range", 0.3, 0.9, "--budget", 3, "--seed", 2**64 - 1, "-o", "b")
     said = call(*arguments)
     assert "the front:" in said and "for 10% use --sampler" in said and "wrote b" in said
     assert sorted(p.name for p in (tmp_path / "b").iterdir()) == ["bench.csv", "bench.json", "chart.png", "chart.svg"]
@@ -192,7 +207,7 @@ def test_bench_refuses_before_anything_runs(refuse, tmp_path):
 
 def test_run_tells_the_error_that_it_reached_and_what_it_chose(call, tmp_path):
     said = call("run", "v.npy", "--range", 0.3, 0.9, "--error", 0.1, "--no-preview", "-o", "e")
-    assert "nodes along the longest axis" in said and "error reached" in said and "the pilot said" in said
+    assert "nodes along the longest axis" in said and "error reached" in said and "predicted" in said
     recipe = json.loads((tmp_path / "e" / "run.json").read_text("utf-8"))["recipe"]
     assert recipe["plan"]["why"] and recipe["reached"] < 0.13
     assert "error reached" in call("run", "v.npy", "--range", 0.3, 0.9, "--grid", 5, "--no-preview", "-o", "plain")
@@ -204,38 +219,38 @@ def test_run_says_what_would_help_noisy_data(call, tmp_path):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         said = call("run", "noise.npy", "--range", 0.4, 0.7, "--grid", 12, "--no-preview", "-o", "n")
-    assert "note: grid: between the nodes" in said and "--smooth 1" in said
+    assert "note: grid: interpolation between nodes" in said and "--smooth 1" in said
 
 
 def test_what_is_foreseen_of_a_grid_is_what_the_grid_will_hold(truth):
     scene, exact = truth
-    race = Race(scene, {"levelset": exact}, [WAY], [9, 21], 3, 5)
-    race.foresee(WAY, Nearest(), 21, 8, 12.5, default=True)
+    race = Race(scene, {"levelset": exact}, [METHOD], [9, 21], 3, 5)
+    race.predict(METHOD, Nearest(), 21, 8, 12.5, default=True)
     (seen,) = race.points
     assert seen.default and not seen.built and seen.seconds == [12.5] * 3 and seen.paths == 8
     asked = exact.queries
     for seed, light in zip((5, 6, 7), seen.light):
-        run = Run(scene, WAY, 21, 3, seed)
+        run = Run(scene, METHOD, 21, 3, seed)
         run.go_on(8)
         grids = run.fill(Nearest())[0]
         whole = seen.covered & covered(grids, asked)
         assert whole.mean() > 0.9
         np.testing.assert_allclose(light[whole], grids[0].lookup(asked.point[whole]), rtol=1e-4, atol=1e-5)
-    assert seen.queries == len(run.answers[0]) and not race.front_ladders()  # it needs no more seeds
-    race.lanes[0].run.grid = 21
-    while lane := race.next(np.inf):
-        race.step(lane)
+    assert seen.queries == sum(map(len, run.bake.answers)) and not race.missing_seeds()  # it needs no more seeds
+    race.contestants[0].run = Run(scene, METHOD, 21, 3, 5)
+    while contestant := race.next(np.inf):
+        race.advance(contestant)
     assert [p.built for p in race.points if p.paths == 8] == [True]  # what is built takes its place
 
 
 def test_runs_default_is_charted_first_and_goes_on(truth):
     scene, exact = truth
-    race = Race(scene, {"levelset": exact}, [WAY], [5, 11], 3, 0)
-    race.show_default(WAY, Nearest(), 11, 64)
+    race = Race(scene, {"levelset": exact}, [METHOD], [5, 11], 3, 0)
+    race.show_default(METHOD, Nearest(), 11, 64)
     (default,) = race.points
     assert default.default and default.built and default.paths == 64
-    while lane := race.next(np.inf):
-        race.step(lane)
+    while contestant := race.next(np.inf):
+        race.advance(contestant)
     assert {p.paths for p in race.points if p.grid == 11} <= {64, 128, 512, 2048}  # no lane starts anew beside it
     assert sum(p.paths == 64 for p in race.points) == 1 and {p.grid for p in race.points} == {5, 11}
 
@@ -245,30 +260,30 @@ def test_it_is_told_where_runs_default_stands(truth):
     truths = {"levelset": exact}
     quick, own = point(exact, 1, 0.09, 8, 16), point(exact, 14.6, 0.2, 8, 64)
     own.default, own.built = True, False
-    records = [told.record(quick, truths, True), told.record(own, truths, False)]
-    said = told.advice(records, BARS, 5)
+    records = [report.record(quick, truths, True), report.record(own, truths, False)]
+    said = report.advice(records, PARTS, 5)
     assert said[1].startswith("run's default (about 15 s, error 20.00%) is beaten by --sampler direct")
     assert "--paths 16 --bounces 5 (1 s, error 9.00%)" in said[1]
-    table = told.table(records)
-    assert table.index("the front:") < table.index("run's default:") < table.index("~14.60")
-    records = [told.record(quick, truths, True), told.record(own, truths, True)]
-    assert "run's default (about 15 s, error 20.00%) is on the front" in told.advice(records, BARS, 5)
+    text = table(records)
+    assert text.index("the front:") < text.index("run's default:") < text.index("~14.60")
+    records = [report.record(quick, truths, True), report.record(own, truths, True)]
+    assert "run's default (about 15 s, error 20.00%) is on the front" in report.advice(records, PARTS, 5)
 
 
 def test_a_default_that_is_too_costly_is_foreseen_and_so_are_its_neighbours(truth, monkeypatch):
     scene, exact = truth
-    race = Race(scene, {"levelset": exact}, [WAY], [5, 11, 22], 3, 0)
+    race = Race(scene, {"levelset": exact}, [METHOD], [5, 11, 22], 3, 0)
     said = _show_default(race, 11, 32, 1e-6)
     assert "~" in said[0] and [(p.grid, p.paths, p.built) for p in race.points] == [(11, 32, False)]
     with monkeypatch.context() as patch:  # a second a path: there is time for three seeds of 8 paths, not of 32
-        patch.setattr("illumgrid.accuracy.chart.timed", lambda *_: Pace(0.0, 1.0))
-        race = Race(scene, {"levelset": exact}, [WAY], [5, 11, 22], 3, 0)
+        patch.setattr("illumgrid.accuracy.chart.measure_pace", lambda *_: Pace(0.0, 1.0))
+        race = Race(scene, {"levelset": exact}, [METHOD], [5, 11, 22], 3, 0)
         _show_default(race, 22, 32, (3 * 8 * 8 * len(exact) + 1000) / 0.15)
     assert {(p.grid, p.paths, p.default) for p in race.points} == {(22, 32, True), (11, 8, False), (22, 8, False)}
     assert not any(p.built for p in race.points)
     shown = {(p.grid, p.paths): p for p in race.points}
     assert shown[22, 32].time == 4 * shown[22, 8].time == 32 * shown[22, 8].queries
-    race = Race(scene, {"levelset": exact}, [WAY], [5, 11, 22], 3, 0)
+    race = Race(scene, {"levelset": exact}, [METHOD], [5, 11, 22], 3, 0)
     assert not _show_default(race, 11, 32, 1e6)
     assert [(p.grid, p.paths, p.built) for p in race.points] == [(11, 32, True)]
 
@@ -284,9 +299,54 @@ def test_points_are_given_up_for_a_sharper_truth_where_light_is_rough(truth):
 
 def test_time_is_kept_for_all_that_another_seed_takes(truth):
     scene, exact = truth
-    race = Race(scene, {"levelset": exact}, [WAY], [8], 3, 0)
+    race = Race(scene, {"levelset": exact}, [METHOD], [8], 3, 0)
     plain, filled, beaten = point(exact, 1.0, 0.2, seeds=1), point(exact, 1.5, 0.1, seeds=1), point(exact, 9.0, 0.3)
     filled.interpolator, beaten.interpolator = Splat(), Rbf()
     plain.filling, filled.filling, beaten.filling = 0.1, 0.6, 8.0
     race.points = [plain, filled, beaten]
-    assert race.front_ladders() == {(id(WAY), 8, 4): pytest.approx(0.9 + 0.1 + 0.6)}
+    assert race.missing_seeds() == {plain: pytest.approx(0.9 + 0.1 + 0.6)}
+
+
+@dataclass(frozen=True)
+class Fake:
+    """A plugin's backend: quick, and light or not, as it says."""
+
+    name: ClassVar[str] = "fake"
+    geometry: ClassVar[str] = "levelset"
+    transport: bool = True
+
+    def solve(self, scene, queries, *, paths, bounces, seed):
+        light = np.ones((len(queries), 3), np.float32)
+        return Samples(queries, light, 0 * light, np.full(len(queries), len(paths), np.int32))
+
+
+@pytest.mark.parametrize("transport", [True, False])
+def test_the_reference_comes_from_the_packages_own_transport_however_quick_a_plugin_is(truth, monkeypatch, transport):
+    scene, exact = truth
+    fake = Fake(transport)
+    found = [("fake", fake, capabilities(fake)), ("numba", BACKEND, capabilities(BACKEND))]
+    packages = {"fake": "illumgrid-fake", "numba": "illumgrid"}
+    monkeypatch.setattr(registry, "backends", lambda: iter(found))
+    monkeypatch.setattr(registry, "entry", lambda kind, name: SimpleNamespace(package=packages[name]))
+    entrants, notes = tracers(scene, exact.queries, 1e6)
+    assert {m.backend.name for m in entrants} == ({"fake", "numba"} if transport else {"numba"})
+    assert transport or "fake does not compete: it computes no light transport" in notes[0]
+    fast = [replace(m, slow=1.0 if m.backend is fake else 9.0) for m in entrants]
+    assert _tracer_of(fast, "levelset") is next(m.tracer for m in fast if m.backend is BACKEND)
+    references, _ = _references(scene, fast, exact.queries[:50], 1e6, 0, [])
+    assert references["levelset"].mean > 1.2  # and not the plugin's 1
+
+
+def test_of_fields_of_different_size_the_default_is_what_run_does():
+    fields = Field("fine", ball(12), range=(0.5, 0.9)), Field("coarse", ball(6, at=(0.5, 0, 0)), range=(0.5, 0.9))
+    scene = Scene(fields, background=np.ones(3))
+    tracer = prepare(BACKEND, scene)
+    exact = begin(tracer, unseen_on_level_sets(scene, 4, 100, 0), 4, 0)
+    race = Race(scene, {"levelset": exact}, [replace(METHOD, tracer=tracer)], [7, 14], 3, 0)
+    made = run_chain(scene, paths=4, bounces=1, isovalues=2)
+    for budget in (1e6, 1e-6):  # built, and predicted
+        race.points = []
+        _show_default(race, None, 4, budget)
+        assert [p.default for p in race.points] == [True]
+        assert race.points[0].queries == made.recipe["queries"] and race.points[0].longest == made.recipe["grid"]
+    assert {max(grid.spec.shape) for grid in made.grids} == {14, 7}

@@ -81,8 +81,11 @@ def test_flat_spots_of_integers_are_no_plateaus():
 def test_noise_is_told_with_what_a_blur_would_bring():
     told = findings(hills(noise=0.1), (0.3, 1.5))
     assert "noise" in told and "--smooth 1" in told["noise"]
+    assert "on a grid of 48 nodes" in told["noise"]
     before, after = (float(text.split("%")[0].split()[-1]) for text in told["noise"].split("about ")[1:])
     assert before > 4 * after
+    finer = findings(hills(noise=0.1), (0.3, 1.5), grid=96)["noise"]
+    assert float(finer.split("%")[0].split()[-1]) == pytest.approx(before / 2**0.7, abs=1)
 
 
 def test_turning_is_that_of_a_sphere():
@@ -107,8 +110,9 @@ def test_turning_does_not_depend_on_the_slabs(monkeypatch):
 def test_thin_parts_are_told_with_the_grid_that_would_do():
     slab = sampled(lambda x: 1 - np.abs(x[:, 2]) / 0.06, (40, 40, 40), origin=(-1,) * 3, spacing=np.full(3, 2 / 39))
     padded = slab.with_values(np.where(np.abs(np.indices(slab.shape) - 19.5).max(axis=0) > 17, -16, slab.values))
-    assert "thin" in findings(padded, (0.2, 0.6)) and "resample" in findings(padded, (0.2, 0.6))["thin"]
-    assert "--grid 40" in findings(padded, (0.2, 0.6), grid=20)["thin"]
+    assert "resample" in findings(padded, (0.2, 0.6), grid=48)["thin"]
+    for grid in (20, 40):  # 40 nodes would lie on the voxels, the worst place
+        assert "--grid 48 has 1.2 nodes per voxel" in findings(padded, (0.2, 0.6), grid=grid)["thin"]
     assert "thin" not in findings(ball(40), (0.3, 0.9))
 
 

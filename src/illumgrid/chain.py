@@ -3,18 +3,19 @@
 import os
 import time
 from collections.abc import Iterable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from importlib.metadata import version
 from typing import Any
 
 import numpy as np
 
 from illumgrid import registry
-from illumgrid.accuracy.choose import judge, planned, rounds
+from illumgrid.accuracy.choose import planned, rounds
+from illumgrid.accuracy.judge import judge as measure_error
 from illumgrid.bake import Map, Progress, bake, enough_bounces, light_left_out
 from illumgrid.constants import PATHS
 from illumgrid.errors import BadInput, tell
-from illumgrid.field.lattice import nodes_over
+from illumgrid.field.lattice import specs_over
 from illumgrid.field.scene import Scene, level_table
 from illumgrid.io import store
 from illumgrid.light import Illumination
@@ -50,6 +51,7 @@ def run(
     seed: int = 0,
     error: float | None = None,
     seconds: float | None = None,
+    judge: bool = True,
     map: Map = map,
     progress: Progress = lambda what, done, total: None,
 ) -> Illumination:
@@ -77,10 +79,12 @@ def run(
         marches level sets, whose error is known before the grid is built.
     seconds : float, optional
         In place of `error`: time to use, for the least error.
+    judge : bool
+        Whether to measure the error reached when the light is done: see `judged`.
     map : callable, optional
         What spreads the work: see `illumgrid.bake.bake`.
     progress : callable, optional
-        Told (what, done, total).
+        Called with (what, done, total).
 
     Returns
     -------
@@ -94,7 +98,7 @@ def run(
     Warns
     -----
     IllumgridWarning
-        When nodes within the range are holes.
+        When the scene has no light, or nodes within the range are holes.
     """
     if paths is not None and not 1 <= paths < 2**31:
         raise BadInput(f"{paths} paths were asked for; expected at least 1 and fewer than 2**31")
@@ -118,7 +122,9 @@ def run(
         progress("pilot", 1, 1)
         grid, bounces = plan.grid, plan.bounces
         walked = [range(plan.paths)] if seconds is None or paths is not None else rounds(plan, begun + seconds)
-    specs = [nodes_over(field.volume, grid) for field in scene.fields]
+    if not _shines(scene):
+        tell("dark", "no background, lamp or surface of this scene emits light: all of it will be 0", stacklevel=2)
+    specs = specs_over(scene, grid)
     tracer = prepare(chosen[1], scene)
     if bounces is None:
         bounces, left_out = enough_bounces(scene, tracer, seed)
@@ -133,9 +139,6 @@ def run(
                 "sample in reach); they show that of the nearest node",
                 stacklevel=2,
             )
-    reached = None
-    if plan is not None:
-        reached = judge(scene, chosen[1], baked.grids, seed, baked.queries, baked.paths, bounces)
     recipe = {
         **{kind: _described(stage) for kind, stage in zip(("sampler", "backend", "interpolator"), chosen)},
         "grid": max(max(spec.shape) for spec in specs),
@@ -145,14 +148,52 @@ def run(
         "isovalues": len(levels.table),
         "seed": seed,
         "queries": baked.queries,
+        "texels": baked.texels,
+        "texel_paths": baked.texel_paths,
         "holes": list(baked.holes),
         "seconds": {stage: round(seconds, 3) for stage, seconds in baked.seconds.items()},
         "relative_error": [grid.relative_error for grid in baked.grids],
         "plan": None if plan is None else asdict(plan),
-        "reached": reached,
+        "reached": None,
+        "reached_uncertain": None,
         "versions": {name: version(name) for name in ("illumgrid", "numpy", "numba", "scipy")},
     }
-    return Illumination(scene, levels, baked.grids, baked.walls, recipe)
+    light = Illumination(scene, levels, baked.grids, baked.walls, recipe)
+    return judged(light, chosen[1]) if judge else light
+
+
+def judged(light: Illumination, backend: Backend) -> Illumination:
+    """The same light with the error that it reached in its recipe; never raises.
+
+    ``reached`` is the relative root mean square error at points that the run did not ask for, ``reached_uncertain`` its
+    standard error. A result is judged on its own surface or not at all: both are None for a backend that traces meshes
+    or computes no light transport, and in the dark.
+
+    Parameters
+    ----------
+    light : Illumination
+        From `run`.
+    backend : Backend
+        The one that computed it.
+    """
+    can, recipe = capabilities(backend), light.recipe
+    if not can.transport or can.surface != "levelset":
+        return light
+    try:
+        tracer = prepare(registry.backend("auto"), light.scene)  # of the same surface, and quick
+        about = (recipe[key] for key in ("seed", "queries", "paths", "bounces"))
+        found = measure_error(light.scene, tracer, light.grids, *about)
+    except Exception as reason:  # a finished run is worth more than its judgement
+        tell("error", f"the error reached could not be measured ({type(reason).__name__}: {reason})", stacklevel=2)
+        return light
+    if found is None:
+        return light
+    return replace(light, recipe={**recipe, "reached": found.rmse, "reached_uncertain": found.uncertain})
+
+
+def _shines(scene: Scene) -> bool:
+    materials = [field.material for field in scene.fields] + [quad.material for quad in scene.quads]
+    return bool(scene.background.any() or any(m.emission.any() for m in materials))
 
 
 def _check_plannable(error: float | None, seconds: float | None, sampler: Any, backend: Any, interpolator: Any) -> None:

@@ -31,6 +31,8 @@ WARNINGS = {
     "empty": "isovalues of the range that have no surface",
     "anisotropy": "voxels much longer along one axis than along another",
     "range": "a range that goes beyond the data",
+    "dark": "a scene without any light",
+    "error": "a finished run whose error could not be measured",
     "grid": "light that the grid cannot hold between its nodes, whatever the paths",
     "holes": "nodes within the range that got no light of their own",
 }

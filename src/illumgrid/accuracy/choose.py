@@ -1,4 +1,4 @@
-"""No more than a scene needs: nodes, paths and bounces for an asked error or time, from a short pilot."""
+"""No more than a scene needs: nodes, paths and bounces for an asked error or time, from a short probe."""
 
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -6,25 +6,61 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from illumgrid.accuracy.probe import FEWEST, MOST, Measured, Pace, Pilot, specs_of, timed
-from illumgrid.accuracy.truth import begin, enough, errors, look_up, unseen_in_volume
-from illumgrid.bake import texel_paths, wall_queries
+from illumgrid.accuracy.cost import Pace, measure_pace
+from illumgrid.accuracy.probe import FEWEST_PATHS, MOST_PATHS, Measured, Probe
+from illumgrid.bake import shifted_seed, texel_paths, wall_queries
+from illumgrid.field.lattice import specs_over
 from illumgrid.field.scene import Levels, Scene
-from illumgrid.field.volume import smooth
-from illumgrid.grid import IlluminationGrid
 from illumgrid.stages import Backend
+from illumgrid.transport.tracer import Tracer, prepare
 
 SHARE = 0.25  # of the asked error that the bounces left out may be
 JUDGED = 0.95  # of the asked seconds: the rest is for the judgement at the end
-PATHS = 16  # from each node, with which grids are tried
-TRUTH = 4  # what its paths take, over others: they are walked twice, with more bounces and with fewer
+TRIAL_PATHS = 16  # from each node, with which grids are tried
+REFERENCE_COST = 4  # of its paths, over others: they are walked twice, with more bounces and with fewer
 SOON = 5.0  # seconds that a look at more points may take even before a shorter run
 MOST_NODES = 40_000_000  # a grid of about 2 GB with all that belongs to it
 
 
 @dataclass(frozen=True)
+class Goal:
+    """What is asked of a run, and what is not left to choose.
+
+    Parameters
+    ----------
+    error : float, optional
+        Relative root mean square error to reach in the least time; else the least error in `seconds`.
+    seconds : float
+    texels : int
+        Of the walls, which take their time too.
+    paths, bounces : int, optional
+    """
+
+    error: float | None = None
+    seconds: float = np.inf
+    texels: int = 0
+    paths: int | None = None
+    bounces: int | None = None
+
+    def work(self, nodes: int) -> int:
+        """Nodes that take as long as these together with the texels."""
+        return nodes + self.texels * texel_paths(nodes, self.texels)
+
+
+@dataclass(frozen=True)
+class Choice:
+    """A size and a number of paths, with the predicted relative error and seconds of the run."""
+
+    measured: Measured
+    paths: int
+    error: float
+    seconds: float
+    met: bool
+
+
+@dataclass(frozen=True)
 class Plan:
-    """What the pilot chose, and why.
+    """What the probe chose, and why.
 
     Parameters
     ----------
@@ -36,7 +72,7 @@ class Plan:
     fill : float
         Seconds of those that go into queries and grids, not into paths.
     pilot : float
-        Seconds that the pilot took.
+        Seconds that the probe took.
     met : bool
         Whether the asked error, or time, is predicted to be kept.
     why : tuple of str
@@ -60,74 +96,100 @@ def sizes(scene: Scene) -> list[int]:
     return [max(4, round(longest * 2.0 ** (k / 2))) for k in range(-8, 3) if longest * 2.0 ** (k / 2) > 5]
 
 
-@dataclass(frozen=True)
-class Choice:
-    """A size and a number of paths, with the predicted relative error and seconds of the run."""
-
-    measured: Measured
-    paths: int
-    error: float
-    seconds: float
-    met: bool
-
-
-def choose(
-    tried: Sequence[Measured], pace: Pace, walls: int, error: float | None, seconds: float, paths: int | None
-) -> Choice:
+def choose(tried: Sequence[Measured], pace: Pace, goal: Goal) -> Choice:
     """The least time for an error, or else the least error for a time; if neither can be had, what comes nearest."""
 
-    def work(m: Measured) -> int:
-        return m.nodes + walls * texel_paths(m.nodes, walls)
-
     def choice(m: Measured, count: int, met: bool) -> Choice:
-        return Choice(m, count, float(np.sqrt(m.squared(count))), pace.seconds(work(m), count), met)
+        return Choice(m, count, float(np.sqrt(m.squared(count))), pace.seconds(goal.work(m.nodes), count), met)
 
-    if error is not None:
-        kept = []
-        for m in tried:
-            count = paths or m.paths_for(error**2)
-            if count and m.squared(count) <= 1.001 * error**2:
-                kept.append(choice(m, count, True))
+    if goal.error is not None:
+        square = goal.error**2
+        counts = [goal.paths or m.paths_for(square) for m in tried]
+        kept = [choice(m, n, True) for m, n in zip(tried, counts) if n and m.squared(n) <= 1.001 * square]
         if kept:
             return min(kept, key=lambda c: c.seconds)
         least = min(m.floor for m in tried)
         best = min((m for m in tried if m.floor <= 1.2 * least), key=lambda m: m.nodes)  # a tenth off, no more
-        return choice(best, paths or best.paths_for(1.25 * best.floor) or 64, False)
-    counts = [paths or min(MOST, pace.paths_in(seconds, work(m))) for m in tried]
-    kept = [choice(m, n, True) for m, n in zip(tried, counts) if n >= FEWEST]
+        return choice(best, goal.paths or best.paths_for(1.25 * best.floor) or 64, False)
+    able = [goal.paths or min(MOST_PATHS, pace.paths_in(goal.seconds, goal.work(m.nodes))) for m in tried]
+    kept = [choice(m, n, True) for m, n in zip(tried, able) if n >= FEWEST_PATHS]
     if kept:
         return min(kept, key=lambda c: c.error)
-    return choice(min(tried, key=lambda m: m.nodes), paths or FEWEST, False)
+    return choice(min(tried, key=lambda m: m.nodes), goal.paths or FEWEST_PATHS, False)
 
 
-def _ladder(
-    pilot: Pilot, candidates: Sequence[int], bounces: int, pace: Pace, error: float | None, seconds: float
-) -> list[Measured]:
-    """Measure grids from coarse to fine until finer ones cannot be the choice."""
-    fewer, found = pilot.fewer(bounces), []
-    for grid in candidates:
-        found.append(now := pilot.measure(grid, fewer, bounces, PATHS))
-        if pace.seconds(now.nodes, FEWEST) > seconds or now.nodes > MOST_NODES:
-            break
-        if error is not None:
-            choice = choose(found, pace, 0, error, np.inf, None)
-            # A finer grid has twice the nodes or more, and needs the paths that the noise alone asks for.
-            if choice.met and pace.seconds(2 * now.nodes, now.paths_within(error**2)) >= choice.seconds:
+@dataclass(frozen=True, eq=False)
+class Look:
+    """Grids measured at some points with some bounces, and the best of them."""
+
+    probe: Probe
+    points: int
+    bounces: int
+    choice: Choice
+    tried: tuple[Measured, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Search:
+    """What all looks share."""
+
+    scene: Scene
+    tracer: Tracer
+    goal: Goal
+    pace: Pace
+
+    def look(
+        self, sizes: Sequence[int], points: int, error: float, seed: int, most: int, bounces: int | None = None
+    ) -> Look:
+        """Measure grids from coarse to fine at some points, until finer ones cannot be the choice."""
+        probe = Probe.start(self.scene, self.tracer, points, error, seed, most)
+        bounces = self.goal.bounces if bounces is None else bounces
+        followed = probe.bounces_for(SHARE * error) if bounces is None else bounces
+        fewer, found, goal = probe.fewer(followed), list[Measured](), replace(self.goal, texels=0)
+        for size in sizes:
+            found.append(now := probe.measure(specs_over(self.scene, size), fewer, TRIAL_PATHS))
+            if self.pace.seconds(now.nodes, FEWEST_PATHS) > goal.seconds or now.nodes > MOST_NODES:
                 break
-    return found
+            if goal.error is not None:
+                choice = choose(found, self.pace, replace(goal, paths=None))
+                # A finer grid has twice the nodes or more, and needs the paths that the noise alone asks for.
+                least = self.pace.seconds(2 * now.nodes, now.paths_within(goal.error**2))
+                if choice.met and least >= choice.seconds:
+                    break
+        return Look(probe, points, followed, choose(found, self.pace, self.goal), tuple(found))
 
+    def first(self, sizes: Sequence[int], seed: int) -> Look:
+        """For an error, a few hundred points; for a time, a tenth of it, and half of that for the reference."""
+        points, most = 384, 1024
+        if self.goal.error is None:
+            each = 2 * 8 * TRIAL_PATHS * self.pace.path
+            if each * len(sizes) * 96 > 0.1 * self.goal.seconds:
+                sizes = sizes[::2]
+            points = int(np.clip(0.1 * self.goal.seconds / (each * len(sizes)), 64, 384))
+            most = int(np.clip(0.05 * self.goal.seconds / (REFERENCE_COST * self.pace.path * points), 64, most))
+        return self.look(sizes, points, self.goal.error or 0.02, seed, most)
 
-def reasons(scene: Scene, choice: Choice, bounces: int, left_out: float) -> tuple[str, ...]:
-    """What was chosen, why, and what was left out, in sentences."""
-    m, part = choice.measured, choice.measured.split
-    still, noise = np.sqrt(max(0.0, part.grid + part.uncovered)), np.sqrt(max(0.0, m.squared(choice.paths) - m.floor))
-    nodes = sum(int(np.prod(spec.shape)) for spec in specs_of(scene, m.grid))
-    return (
-        f"{m.grid} nodes along the longest axis: between them the light is off by {still:.1%}",
-        f"{choice.paths} paths: their noise, read between nodes, is {noise:.1%}",
-        f"{bounces} bounces: further ones would add {left_out:.1%}",
-        f"{nodes - m.nodes} of {nodes} nodes are left out: no isosurface of the range is near them",
-    )
+    def closer(self, look: Look, sizes: Sequence[int], seed: int, late: bool) -> Look:
+        """Look at more points around the choice: for a sixth of the run's time, for an error as long as they differ.
+
+        For an error every finer grid, in turn: the choice may have been so good by chance.
+        """
+        goal, chosen = self.goal, look.choice.measured.grid
+        near = [size for size in sizes if 0.6 < size / chosen < (1.7 if goal.error is None else np.inf)]
+        each = self.pace.path * (2 * 8 * TRIAL_PATHS * len(near[:3]) + REFERENCE_COST * 128)  # seconds a point
+        more = min(8192, int(min(8192.0, look.choice.seconds / 6 / each))) if goal.error is None else 4096
+        if goal.error is None and late:  # the first look was slow: what is left is for the run
+            return look
+        while more > 1.5 * look.points:
+            error, bounces = goal.error or look.choice.error, None
+            if goal.error is None:  # by the few points of the first look: more would take too long
+                bounces = look.bounces if goal.bounces is not None else look.probe.bounces_for(SHARE * error)
+            # More points tell more than a sharper reference at each: its variance is subtracted.
+            look, more = self.look(near, more, error, seed, 128, bounces), 0
+            if goal.error is not None and look.choice.measured.parts.uncertain > 0.05 * goal.error**2:
+                # A few points carry the error, as where the field is noisy: many more are needed to tell it.
+                more = int(min(4 * look.points, 16384, max(SOON, look.choice.seconds) / each))
+        return look
 
 
 def planned(
@@ -154,99 +216,54 @@ def planned(
     error : float, optional
         Relative root mean square error to reach, in the least time.
     seconds : float, optional
-        Time to use, pilot included, for the least error.
+        Time to use, this choice included, for the least error.
     grid, paths, bounces : int, optional
         What is not left to choose.
     seed : int
     """
-    begun = time.perf_counter()
-    walls = sum(len(queries) for queries in wall_queries(scene, levels))
+    begun, tracer = time.perf_counter(), prepare(backend, scene)
+    left = np.inf if seconds is None else JUDGED * seconds
+    goal = Goal(error, left, sum(len(queries) for queries in wall_queries(scene, levels)), paths, bounces)
     candidates = [grid] if grid else sizes(scene)
-    closed = not scene.background.any()  # light lives long there
-    pace = timed(scene, backend, candidates[len(candidates) // 2], 32, 12 if closed else 4, seed, 1 << 14)
-    goal, left, points, most = 0.02 if error is None else error, np.inf, 384, 1024
-    first = candidates
-    if seconds is not None:  # the first look takes a tenth of the time, and its truth half of that
-        left = JUDGED * seconds
-        each = 2 * 8 * PATHS * pace.path
-        if each * len(candidates) * 96 > 0.1 * left:
-            first = candidates[::2]
-        points = int(np.clip(0.1 * left / (each * len(first)), 64, 384))
-        most = int(np.clip(0.05 * left / (TRUTH * pace.path * points), 64, most))
-    pilot = Pilot.start(scene, backend, points, goal, seed, most)
-    followed = pilot.bounces_for(SHARE * goal) if bounces is None else bounces
-    tried = _ladder(pilot, first, followed, pace, error, left)
-    choice = choose(tried, pace, walls, error, left, paths)
-    # For an error every finer grid, in turn: the choice may have been so good by chance.
-    near = [size for size in candidates if 0.6 < size / choice.measured.grid < (1.7 if error is None else np.inf)]
-    # A closer look around it, at more points: for a sixth of the time that the run will take, or with time to spare.
-    look = pace.path * (2 * 8 * PATHS * len(near[:3]) + TRUTH * 128)  # seconds a point
-    more = int(min(8192.0, choice.seconds / 6 / look))
-    if error is not None:
-        more = 4096
-    elif time.perf_counter() - begun > 0.35 * left:  # the first look was slow: what is left is for the run
-        more = 0
-    while more > 1.5 * points:
-        points, goal = more, choice.error if error is None else error
-        if error is None and bounces is None:  # by the few points of the first look: more would take too long
-            followed = pilot.bounces_for(SHARE * goal)
-        # More points tell more than a sharper truth at each: its variance is subtracted.
-        pilot = Pilot.start(scene, backend, points, goal, seed + 1, 128)
-        if error is not None and bounces is None:
-            followed = pilot.bounces_for(SHARE * goal)
-        tried = _ladder(pilot, near, followed, pace, error, left)
-        choice, more = choose(tried, pace, walls, error, left, paths), 0
-        if error is not None and choice.measured.split.uncertain > 0.05 * error**2:
-            # A few points carry the error, as where the field is noisy: many more are needed to tell it.
-            more = int(min(4 * points, 16384, max(SOON, choice.seconds) / look))
-    about = 1 << 16 if seconds is None else int(np.clip(0.02 * left / pace.path, 1 << 12, 1 << 16))
-    pace = timed(scene, backend, choice.measured.grid, choice.paths, followed, seed, about)
-    choice = choose(tried, pace, walls, error, left - (time.perf_counter() - begun), paths)
+    depth = 4 if scene.background.any() else 12  # light lives long in a closed room
+    middle = specs_over(scene, candidates[len(candidates) // 2])
+    search = Search(scene, tracer, goal, measure_pace(scene, tracer, middle, 32, depth, seed, 1 << 14))
+    look = search.first(candidates, seed)
+    look = search.closer(look, candidates, shifted_seed(seed, 1), time.perf_counter() - begun > 0.35 * left)
+    about = 1 << 16 if seconds is None else int(np.clip(0.02 * left / search.pace.path, 1 << 12, 1 << 16))
+    specs = specs_over(scene, look.choice.measured.grid)
+    pace = measure_pace(scene, tracer, specs, look.choice.paths, look.bounces, seed, about)
+    choice = choose(look.tried, pace, replace(goal, seconds=left - (time.perf_counter() - begun)))
+    why = reasons(scene, choice, look.bounces, look.probe.left_out(look.bounces))
     return Plan(
-        choice.measured.grid, choice.paths, followed, choice.error, choice.seconds,
-        choice.measured.nodes * pace.node, time.perf_counter() - begun, choice.met,
-        reasons(scene, choice, followed, pilot.left_out(followed)),
+        choice.measured.grid, choice.paths, look.bounces, choice.error, choice.seconds,
+        choice.measured.nodes * pace.node, time.perf_counter() - begun, choice.met, why,
     )  # fmt: skip
+
+
+def reasons(scene: Scene, choice: Choice, bounces: int, left_out: float) -> tuple[str, ...]:
+    """What was chosen, why, and what was left out, in sentences."""
+    m, part = choice.measured, choice.measured.parts
+    still, noise = np.sqrt(max(0.0, part.grid + part.uncovered)), np.sqrt(max(0.0, m.squared(choice.paths) - m.floor))
+    nodes = sum(int(np.prod(spec.shape)) for spec in specs_over(scene, m.grid))
+    return (
+        f"{m.grid} nodes along the longest axis: interpolation between them is off by {still:.1%}",
+        f"{choice.paths} paths: noise of {noise:.1%} after interpolation",
+        f"{bounces} bounces: further ones would add {left_out:.1%}",
+        f"{nodes - m.nodes} of {nodes} nodes are omitted: no isosurface of the range is near them",
+    )
 
 
 def rounds(plan: Plan, until: float, clock: Callable[[], float] = time.perf_counter) -> Iterator[range]:
     """Paths for a run that is to end at a time: a quarter of the plan's, then as many as their pace leaves time for.
 
-    The pilot times a few thousand paths, which is good enough to choose a grid but, on a machine that does other things
+    The probe times a few thousand paths, which is good enough to choose a grid but, on a machine that does other things
     as well, not to promise a time.
     """
-    begun, done, more = clock(), 0, max(FEWEST, 2 * (plan.paths // 8))
+    begun, done, more = clock(), 0, max(FEWEST_PATHS, 2 * (plan.paths // 8))
     after = plan.fill + (1 - JUDGED) * (until - begun)
-    while more >= max(2, done // 16) and done < MOST:
+    while more >= max(2, done // 16) and done < MOST_PATHS:
         yield range(done, done + more)
         done += more
         now = clock()
         more = 2 * int((until - after - now) * done / (now - begun) / 2)
-
-
-def judge(
-    scene: Scene, backend: Backend, grids: Sequence[IlluminationGrid], seed: int, queries: int, paths: int, bounces: int
-) -> float:
-    """Relative RMS error of grids at points that neither they nor the pilot asked for, the truth's own subtracted.
-
-    For a twentieth of the run's work, or what 1024 points take: as many paths as the grids had, which makes the truth
-    as sharp as they are, and the more points, for where the light is rough a few of them carry the error. How many is
-    settled beforehand: who goes on until the truth is sharper than what he found stops where chance made that large.
-    """
-    followed = enough(scene, backend, 1e-3, seed)
-    work = queries * paths * (bounces + 1) / (20 * (followed + 1))
-    points = int(np.clip(work / paths, 1024, 4096))
-    many = 2 ** round(np.log2(np.clip(work / points, 32, max(32, paths))))
-    truth = begin(scene, backend, unseen_in_volume(scene, points, seed + 2), followed, seed + 2, many)
-    return errors(look_up(grids, truth.queries), truth).rmse
-
-
-def helps(scene: Scene, backend: Backend, grid: int, bounces: int, seed: int) -> dict[str, float]:
-    """Relative error without noise of a grid as it is, with twice the nodes, and of a field that is smoothed."""
-    soft = replace(scene, fields=tuple(replace(f, volume=smooth(f.volume, 1.0)) for f in scene.fields))
-    found = {}
-    for what, of, nodes in (("now", scene, grid), ("finer", scene, 2 * grid), ("smooth", soft, grid)):
-        pilot = Pilot.start(of, backend, 512, 0.05, seed, most=128)  # a hint: it must not cost more than the run
-        part = pilot.measure(nodes, pilot.fewer(bounces), bounces, 32).split
-        found[what] = float(np.sqrt(max(0.0, part.total - part.noise)))
-    return found

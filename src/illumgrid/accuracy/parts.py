@@ -5,13 +5,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from illumgrid.accuracy.truth import Truth
+from illumgrid.accuracy.reference import Reference
 from illumgrid.field.volume import Floats
 
 
 @dataclass(frozen=True)
-class Split:
-    """The mean squared error of a grid in four parts, each measured; all as squares relative to the mean irradiance.
+class Parts:
+    """The mean squared error of a grid in parts, each measured; all as squares relative to the mean irradiance.
 
     Parameters
     ----------
@@ -25,7 +25,7 @@ class Split:
     bounces : float
         Mean square of the light that more bounces add at the points themselves.
     cross : float
-        What the sum of the four lacks of the total: the grid's error and the missing bounces go together.
+        What the sum of the four lacks of the total: the grid's error and the missing bounces are correlated.
     uncertain : float
         Standard error of `grid`, from the spread over the points.
     """
@@ -43,35 +43,35 @@ class Split:
         return max(0.0, self.noise + self.grid + self.uncovered + self.bounces + self.cross)
 
 
-def missing(fewer: Truth, truth: Truth) -> Floats:
-    """Light (n, 3), relative, that the bounces beyond those of `fewer` add; the truth walks the same paths further."""
-    return (truth.light - fewer.light) / truth.mean
+def missing(fewer: Reference, reference: Reference) -> Floats:
+    """Light (n, 3), relative, that the bounces beyond those of `fewer` add to the same paths."""
+    return (reference.light - fewer.light) / reference.mean
 
 
-def split(one: Floats, other: Floats, covered: NDArray[np.bool_], fewer: Truth, truth: Truth) -> Split:
+def parts_of(one: Floats, other: Floats, covered: NDArray[np.bool_], fewer: Reference, reference: Reference) -> Parts:
     """Split the error of a grid.
 
     Parameters
     ----------
     one, other : (n, 3) float64
-        What two grids that differ in nothing but their seeds hold at the points of the truth.
+        What two grids that differ in nothing but their seeds hold at the points of the reference.
     covered : (n,) bool
         Points whose nodes all have light of their own.
-    fewer : Truth
-        The light at those points by the paths of the truth, cut off after as many bounces as the grids had.
-    truth : Truth
+    fewer : Reference
+        The light at those points by the same paths, cut off after as many bounces as the grids had.
+    reference : Reference
     """
-    light = fewer.light
-    first, second = (one - light) / truth.mean, (other - light) / truth.mean
-    more = missing(fewer, truth)
-    # The paths that stand for the truth here are in both errors: their own variance is subtracted.
-    own = (fewer.off**2).mean(axis=1) / truth.mean**2
-    both = (first * second).mean(axis=1) - own
-    return Split(
+    light, mean = fewer.light, reference.mean
+    first, second = (one - light) / mean, (other - light) / mean
+    more = missing(fewer, reference)
+    # The paths that stand for the exact light are in both errors: their own variance is subtracted.
+    both = (first * second).mean(axis=1) - (fewer.off**2).mean(axis=1) / mean**2
+    inside = np.where(covered, both, 0.0)
+    return Parts(
         noise=float(((first - second) ** 2).mean()) / 2,
-        grid=float(np.where(covered, both, 0.0).mean()),
+        grid=float(inside.mean()),
         uncovered=float(np.where(covered, 0.0, both).mean()),
         bounces=float((more**2).mean()),
         cross=-float(((first + second) * more).mean()),
-        uncertain=float(np.where(covered, both, 0.0).std() / np.sqrt(len(both))),
+        uncertain=float(inside.std() / np.sqrt(len(both))),
     )

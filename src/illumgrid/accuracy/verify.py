@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from illumgrid import registry
-from illumgrid.accuracy.truth import apart
+from illumgrid.accuracy.points import other_paths
 from illumgrid.errors import BadInput
 from illumgrid.field.volume import Floats
 from illumgrid.stages import Backend
@@ -118,7 +118,7 @@ def _measure(case: Case, backend: Backend, paths: int, seed: int) -> tuple[Float
     if case.area is None:
         one, other = (
             backend.solve(case.scene, case.queries, paths=range(count // 2), bounces=case.bounces, seed=s)
-            for s in (seed, apart(seed))
+            for s in (seed, other_paths(seed))
         )
         good = (one.paths > 0) & (other.paths > 0)
         light, bar = (

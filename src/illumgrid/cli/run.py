@@ -1,6 +1,5 @@
 """``illumgrid run``: the whole chain, from a volume or a scene to a finished folder."""
 
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
@@ -198,7 +197,6 @@ def run(
 
     DIR then holds illumination.exr, run.json and preview.png, and needs nothing else.
     """
-    begun = time.perf_counter()
     from illumgrid.chain import run as light_up
     from illumgrid.field.diagnosis import diagnose
     from illumgrid.field.lattice import nodes_over
@@ -227,19 +225,15 @@ def run(
         with progress_bars() as progress:
             light = light_up(
                 scene, **stages, grid=grid, paths=paths, bounces=bounces, isovalues=isovalues, seed=seed,
-                error=error, seconds=seconds, progress=progress,
+                error=error, seconds=seconds, judge=False, progress=progress,
             )  # fmt: skip
-            light = _judged(light, stages["backend"], seed)
-        _told_help(light, stages)
-    recipe = {
-        **light.recipe,
-        "input": asked.name if source is None else source,
-        "reading": reading,
-        "smooth": smooth or 0.0,
-        "warnings": sentences,
-    }
-    replace(light, recipe=recipe).save(folder, preview=not no_preview, overwrite=overwrite)
-    _told_result(light, folder, time.perf_counter() - begun, picture=not no_preview)
+        about = {"input": asked.name if source is None else source, "reading": reading, "smooth": smooth or 0.0}
+        light = replace(light, recipe={**light.recipe, **about, "warnings": sentences})
+        light.save(folder, preview=not no_preview, overwrite=overwrite)
+        light = _judged(light, stages, folder)
+        about = {key: light.recipe[key] for key in ("reached", "reached_uncertain")}
+        store.amend(folder, {**about, "warnings": sentences})
+    _report(light, folder, picture=not no_preview)
 
 
 def _why_auto() -> str:
@@ -249,47 +243,53 @@ def _why_auto() -> str:
     return f"backend: {registry.auto_backend()} ({registry.WHY_AUTO})"
 
 
-def _judged(light: "Illumination", backend: Any, seed: int) -> "Illumination":
-    """With the error that was reached, where the backend can tell it at points that each have a level set."""
-    from illumgrid import registry
-    from illumgrid.accuracy.choose import judge
+def _judged(light: "Illumination", stages: dict[str, Any], folder: Path) -> "Illumination":
+    """With the error that was reached; Ctrl-C ends the judgement, not the finished run."""
+    from illumgrid.chain import judged
 
-    if light.recipe.get("reached") or backend.geometry == "mesh":
-        return light
-    done = [light.recipe[of] for of in ("queries", "paths", "bounces")]
-    found = judge(light.scene, registry.backend("auto"), light.grids, seed, *done)
-    return replace(light, recipe={**light.recipe, "reached": found})
+    try:
+        light = judged(light, stages["backend"])
+        _advise(light, stages)
+    except KeyboardInterrupt:
+        say(f"stopped before the error was measured; the light itself is complete in {folder}")
+    return light
 
 
-def _told_help(light: "Illumination", stages: dict[str, Any]) -> None:
-    """Where more paths would not help much, what would."""
-    from illumgrid.accuracy.choose import helps
+def _advise(light: "Illumination", stages: dict[str, Any]) -> None:
+    """Where more paths would not help much, say what would."""
+    from illumgrid.accuracy.judge import remedies
 
     recipe = light.recipe
-    if (stages["sampler"].name, stages["interpolator"].name) != ("direct", "nearest") or not recipe.get("reached"):
+    if (stages["sampler"].name, stages["interpolator"].name) != ("direct", "nearest") or not recipe["reached"]:
         return
     noise = max((e or 0.0 for e in recipe["relative_error"]), default=0.0)
     if recipe["reached"] < max(0.05, 1.5 * noise):
         return
-    found = helps(light.scene, stages["backend"], recipe["grid"], recipe["bounces"], recipe["seed"])
-    told = f"between the nodes the light is off by about {found['now']:.1%}, whatever the paths"
+    specs = [grid.spec for grid in light.grids]
+    found = remedies(light.scene, stages["backend"], specs, recipe["bounces"], recipe["seed"])
+    if not found:
+        return
+    text = f"interpolation between nodes is off by about {found['now']:.1%} at any number of paths"
     if found["finer"] < 0.8 * found["now"]:
-        told += f"; --grid {2 * recipe['grid']} would make that {found['finer']:.1%}"
+        text += f"; --grid {2 * recipe['grid']} would reduce that to {found['finer']:.1%}"
     if found["smooth"] < 0.8 * found["now"]:
-        told += f"; --smooth 1, which lights a field without its noise, {found['smooth']:.1%}"
-    tell("grid", told)
+        text += f"; --smooth 1, which lights a field without its noise, to {found['smooth']:.1%}"
+    tell("grid", text)
 
 
-def _told_result(light: "Illumination", folder: Path, seconds: float, picture: bool) -> None:
+def _report(light: "Illumination", folder: Path, picture: bool) -> None:
     recipe = light.recipe
     errors = [e for e in recipe["relative_error"] if e is not None]
     noise = f", noise about {max(errors):.1%} of the mean light" if errors else ""
-    plan, reached = recipe.get("plan"), recipe.get("reached")
+    plan, reached = recipe["plan"], recipe["reached"]
     if plan:
         for sentence in plan["why"]:
             say(f"  {sentence}")
-    say(f"{recipe['queries']} queries x {recipe['paths']} paths in {seconds:.1f} s{noise}{omitted_light(recipe)}")
+    work = f"{recipe['queries'] - recipe['texels']} queries x {recipe['paths']} paths"
+    if recipe["texels"]:
+        work += f" and {recipe['texels']} texels of walls x {recipe['texel_paths']} paths"
+    say(f"{work} in {sum(recipe['seconds'].values()):.1f} s{noise}{omitted_light(recipe)}")
     if reached:
-        asked = f"; the pilot said {plan['error']:.2%}" if plan else ""
-        say(f"error reached: {reached:.2%} of the mean light{asked}")
+        predicted = f"; predicted: {plan['error']:.2%}" if plan else ""
+        say(f"error reached: {reached:.2%} +- {recipe['reached_uncertain']:.2%} of the mean light{predicted}")
     say(f"wrote {folder}" + (f"; look at {folder / 'preview.png'}" if picture else ""))

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from illumgrid.constants import DENSITY
 from illumgrid.field.labels import labels_in
 from illumgrid.field.lattice import GridSpec
 from illumgrid.field.scene import Field
@@ -23,6 +24,7 @@ _SIDE = 64  # voxels along the longest axis of the field on which they are count
 _ROUGH = 0.5  # normals that turn this much from voxel to voxel are rough (see `turning`)
 _SOOTHED = 0.8  # ... and if a blur by one voxel brings them to this share, it is noise and not shape
 _FLOOR = 0.12  # over turning²; within a factor of two on raw and blurred volumes of ten kinds (docs/stability.md)
+_FALLS = 0.7  # the power of nodes per voxel with which that falls; 0.5 to 0.8 on most (docs/speed_and_accuracy.md)
 _THIN = 0.25  # share of the surface of what is thinner than two nodes
 _FEW = 4  # voxels on the smaller side of a level set that hardly is one
 _TOUCHED = 1e-3  # share of the border's voxels that are solid
@@ -31,7 +33,7 @@ _ANISOTROPY = 3.0
 
 @dataclass(frozen=True)
 class Finding:
-    """What will go wrong, told before the light is computed.
+    """What will go wrong, reported before the light is computed.
 
     Parameters
     ----------
@@ -180,12 +182,13 @@ def _plateau(field: Field) -> Iterator[Finding]:
     )
 
 
-def floor_of(turn: float) -> float:
-    """Relative error that a grid of one node a voxel keeps at any number of paths, from `turning`."""
-    return _FLOOR * turn**2
+def floor_of(turn: float, density: float = 1.0) -> float:
+    """Relative error of a grid at any number of paths, from `turning` and its nodes per voxel along an axis."""
+    return float(_FLOOR * turn**2 / density**_FALLS)
 
 
-def _noise(field: Field) -> Iterator[Finding]:
+def _noise(field: Field, spec: GridSpec) -> Iterator[Finding]:
+    density = max(spec.shape) / max(field.volume.shape)
     turn = turning(field.volume, *field.range)
     if turn < _ROUGH:
         return
@@ -194,8 +197,9 @@ def _noise(field: Field) -> Iterator[Finding]:
         yield Finding(
             "noise",
             f"normals of field {field.name!r} turn by {2 * np.degrees(np.arcsin(min(turn / 2, 1))):.0f} degrees from "
-            f"voxel to voxel: the light will keep an error of about {floor_of(turn):.0%} at any number of paths; "
-            f"--smooth 1 would bring it to about {floor_of(after):.0%}",
+            f"voxel to voxel: on a grid of {max(spec.shape)} nodes the light keeps an error of about "
+            f"{floor_of(turn, density):.0%} at any number of paths; --smooth 1 would reduce it to about "
+            f"{floor_of(after, density):.0%}",
         )
 
 
@@ -223,8 +227,8 @@ def _thin(field: Field, spec: GridSpec) -> Iterator[Finding]:
     deeper = interpolate(volume, index + 2 * spec.spacing.max() * inward / volume.spacing)
     lost = float((~field.solid(deeper, middle)).mean())
     if lost > _THIN:
-        longest, enough = max(spec.shape), max(volume.shape)
-        todo = f"--grid {enough} puts a node on every voxel" if longest < enough else "resample the volume finer"
+        longest, enough = max(spec.shape), round(DENSITY * max(volume.shape))  # not one on each voxel: noise is worst
+        todo = f"--grid {enough} has {DENSITY} nodes per voxel" if longest < enough else "resample the volume finer"
         yield Finding(
             "thin",
             f"{lost:.0%} of the surface of field {field.name!r} at {middle:.4g} is that of parts thinner than two "
@@ -302,5 +306,5 @@ def _labels(field: Field) -> Iterator[Finding]:
 
 def diagnose(field: Field, spec: GridSpec) -> list[Finding]:
     """All that warns of a field under its range and the grid that is meant for it."""
-    found = [*_labels(field), *_plateau(field), *_noise(field), *_thin(field, spec), *_border(field), *_empty(field)]
+    found = [*_labels(field), *_plateau(field), *_noise(field, spec), *_thin(field, spec), *_border(field), *_empty(field)]
     return [*found, *_anisotropy(field), *_range(field)]

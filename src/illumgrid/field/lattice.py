@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from illumgrid.constants import DENSITY, LONGEST
 from illumgrid.errors import BadInput
+from illumgrid.field.scene import Scene
 from illumgrid.field.volume import Floats, Lattice, Volume, index_to_world, placement
 
 MOST_NODES = 2**16  # along an axis: such a cube is beyond any memory, and its number of nodes still fits 64 bits
@@ -66,3 +67,8 @@ class GridSpec:
 def nodes_over(volume: Volume, longest: int | None = None) -> GridSpec:
     """Nodes of a volume's grid; see `illumgrid.constants.DENSITY`."""
     return GridSpec.over(volume, min(round(DENSITY * max(volume.shape)), LONGEST) if longest is None else longest)
+
+
+def specs_over(scene: Scene, longest: int | None = None) -> list[GridSpec]:
+    """Nodes of every field's grid: see `nodes_over`."""
+    return [nodes_over(field.volume, longest) for field in scene.fields]

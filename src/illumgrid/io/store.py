@@ -132,6 +132,25 @@ def write(folder: str | os.PathLike[str], stored: Stored, picture: bytes | None,
             _move(fresh, place, Path(work) / "old", overwrite)
 
 
+def amend(folder: str | os.PathLike[str], changes: Record) -> None:
+    """Change entries of a finished run's recipe; its arrays stay as they are.
+
+    Raises
+    ------
+    BadInput
+        If the record cannot be read, or written anew.
+    """
+    place = Path(os.path.abspath(folder))
+    with _sentences(f"{folder} could not be amended", AGAIN):
+        record = _read_record(place / RUN)
+        record["recipe"].update(json.loads(json.dumps(changes, allow_nan=False)))
+        record["checksum"] = _checksum(record, place / EXR)
+        with tempfile.TemporaryDirectory(prefix=f".{place.name[:50]}-", dir=place.parent) as work:
+            fresh = Path(work) / RUN
+            fresh.write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
+            fresh.replace(place / RUN)
+
+
 def _move(fresh: Path, place: Path, old: Path, overwrite: bool) -> None:
     """Rename `fresh` to `place`; an older run there goes to `old`, and back if that fails.
 

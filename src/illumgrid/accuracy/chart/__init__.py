@@ -1,66 +1,70 @@
 """The speed-accuracy chart: seconds against error, for everything that is registered, on the user's own data."""
 
 import time
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from illumgrid import registry
-from illumgrid.accuracy.chart.contestants import ways
-from illumgrid.accuracy.chart.picture import Studio
-from illumgrid.accuracy.chart.race import SEEDS, Point, Race, front
-from illumgrid.accuracy.chart.whence import Bar, bars
-from illumgrid.accuracy.probe import Pilot, specs_of, timed
-from illumgrid.accuracy.truth import Truth, begin, converge, enough, unseen_on_level_sets
-from illumgrid.bake import Progress, light_left_out
+from illumgrid.accuracy.chart.methods import Method, methods, tracers
+from illumgrid.accuracy.chart.race import SEEDS, Flip, Point, Race, front
+from illumgrid.accuracy.cost import measure_pace
+from illumgrid.accuracy.points import unseen_on_level_sets
+from illumgrid.accuracy.probe import Measured, Probe
+from illumgrid.accuracy.reference import Reference, begin, converge, enough
+from illumgrid.bake import Progress, light_left_out, shifted_seed
 from illumgrid.constants import PATHS
 from illumgrid.errors import BadInput
-from illumgrid.field.lattice import nodes_over
+from illumgrid.field.lattice import specs_over
 from illumgrid.field.scene import Scene
+from illumgrid.field.volume import Floats
 from illumgrid.samplers.direct import Direct, reachable
-from illumgrid.stages import Backend
 from illumgrid.transport.samples import Queries
-from illumgrid.transport.tracer import prepare
+from illumgrid.transport.tracer import Tracer, prepare
 
-TRUTH, PARTS, PICTURE, OTHER = 0.25, 0.12, 0.05, 0.05
-"""Shares of the budget: for the truth, the parts of the error, the converged picture, and to begin another truth."""
+# Shares of the budget.
+REFERENCES, PARTS, PICTURE = 0.25, 0.12, 0.05  # for the references, the parts of the error, the converged picture
+OTHER = 0.05  # to begin the reference of another surface, at most
+DEFAULT, PREDICTED = 0.3, 0.15  # for `run`'s default, at most; if that is too little, to predict such grids
 
-DEFAULT, FORESEEN = 0.3, 0.15
-"""Shares of the budget, at most, for `run`'s default and, if that is too little, for what of such grids is foreseen."""
-
-GOAL, FEWEST = 0.01, 500
-"""Own error of the truth, a fifth of 5 %, for which points are given up where light is rough; so many stay at least."""
-
+GOAL, FEWEST = 0.01, 500  # own error of a reference, for which points are dropped where light is rough, to so many
 LONGEST = 1e7  # seconds of a budget: four months; counts of paths in proportion to it stay whole numbers
+PARTS_PATHS, PARTS_REFERENCE = (16, 64, 256), 256
+PARTS_POINTS = (512, 4096)
+
+Studio = Callable[[Scene, Tracer, Floats, int, int, float], Flip | None]
+"""From a scene, its tracer, radiance (n, 3) to expose for, bounces, a seed and about how many paths a converged picture
+may take: what compares grids with that picture, or None if those are too few."""
 
 
 @dataclass(frozen=True, eq=False)
 class Report:
-    """What a race showed.
-
-    Parameters
-    ----------
-    points : tuple of Point
-    front : tuple of Point
-        Those that nobody beats in both time and error, from fast to accurate.
-    truths : dict of Truth
-        By surface.
-    bars : tuple of Bar
-        Where the error of the direct way comes from, over grids and paths.
-    bounces : int
-    notes : tuple of str
-        Who takes no part, and why; whatever else a reader must know.
-    seconds : float
-        That all of it took, from warm kernels on.
-    """
+    """What a race showed."""
 
     points: tuple[Point, ...]
-    front: tuple[Point, ...]
-    truths: dict[str, Truth]
-    bars: tuple[Bar, ...]
+    front: tuple[Point, ...]  # from fast to accurate
+    references: dict[str, Reference]  # by surface
+    parts: tuple[Measured, ...]  # of the error of `Direct` with `Nearest`, over grids and paths
     bounces: int
-    notes: tuple[str, ...]
+    notes: tuple[str, ...]  # which backends do not compete, and why; whatever else a reader must know
+    seconds: float  # that all of it took, from warm kernels on
+
+
+@dataclass(frozen=True)
+class Budget:
+    """A time to use, from now on."""
+
     seconds: float
+    begun: float
+
+    def spent(self) -> float:
+        """Seconds since the beginning."""
+        return time.perf_counter() - self.begun
+
+    def left(self, share: float = 1.0) -> float:
+        """Seconds until a share of the budget is spent."""
+        return share * self.seconds - self.spent()
 
 
 def sizes(scene: Scene) -> list[int]:
@@ -68,49 +72,8 @@ def sizes(scene: Scene) -> list[int]:
 
     Nodes on voxels are the worst place to ask on noisy data (docs/stability.md).
     """
-    default = default_grid(scene)
+    default = max(max(spec.shape) for spec in specs_over(scene))
     return sorted({max(4, round(default * share)) for share in (0.25, 0.5, 1.0, 1.6)})
-
-
-def default_grid(scene: Scene) -> int:
-    """Nodes along the longest axis, of the field that has most, when `illumgrid.run` is asked for nothing else."""
-    return max(max(nodes_over(field.volume).shape) for field in scene.fields)
-
-
-def _unseen(scene: Scene, budget: float, seed: int) -> Queries:
-    """Points of the truth: as many level sets as a small share of the budget allows, of forty to a hundred points."""
-    for points in (8, 64):  # the first one loads what extracts surfaces
-        begun = time.perf_counter()
-        unseen_on_level_sets(scene, 1, points, seed)
-        one = time.perf_counter() - begun
-    levels = int(np.clip(0.05 * budget / one, 8, 48))
-    return unseen_on_level_sets(scene, levels, int(np.clip(100 * levels, 1200, 4000)), seed)
-
-
-def _thinned(truth: Truth, surface: str, spent: float, left: float, seed: int) -> Truth:
-    """As many of a truth's points, which took so many seconds, as can be sharpened to GOAL in the time that is left."""
-    takes = spent * (truth.error / GOAL) ** 2
-    keep = int(np.clip(len(truth) * left / max(takes, 1e-9), min(FEWEST, len(truth)), len(truth)))
-    chosen = np.sort(np.random.default_rng((seed, 4)).permutation(len(truth))[:keep])
-    return replace(truth[chosen], surface=surface)
-
-
-def _grown(
-    truths: dict[str, Truth], tracers: dict[str, Backend], scene: Scene, seed: int, error: dict[str, float], left: float
-) -> None:
-    """The truths with more paths, until their own errors are small enough or the time is over.
-
-    The first, which judges most, comes last: it has what the others leave.
-    """
-    end = time.perf_counter() + left
-    for rest, (surface, truth) in zip(range(len(truths), 0, -1), reversed(list(truths.items()))):
-        spent, begun = 0.0, time.perf_counter()
-        until = begun + (end - begun) / rest
-        while truth.error > error[surface] and time.perf_counter() + 2 * spent < until and truth.paths < 1 << 15:
-            step = time.perf_counter()
-            truth = converge(truth, scene, tracers[surface], seed, 0.0, 2 * truth.paths)
-            spent = time.perf_counter() - step
-        truths[surface] = truth
 
 
 def bench(
@@ -118,7 +81,8 @@ def bench(
     budget: float = 120.0,
     seed: int = 0,
     progress: Progress = lambda what, done, total: None,
-    default: tuple[int, int] | None = None,
+    default: tuple[int | None, int] = (None, PATHS),
+    studio: Studio | None = None,
 ) -> Report:
     """Race all contestants on a scene.
 
@@ -129,9 +93,11 @@ def bench(
         Seconds, from warm kernels on.
     seed : int
     progress : callable, optional
-        Told (what, done, total).
-    default : (int, int), optional
+        Called with (what, done, total).
+    default : (int or None, int), optional
         Nodes and paths that are marked as the default of `run`; by default those of `illumgrid.run`.
+    studio : callable, optional
+        What takes pictures, for the difference that an eye would see.
 
     Raises
     ------
@@ -140,106 +106,196 @@ def bench(
     """
     if not 0 < budget <= LONGEST:
         raise BadInput(
-            f"a budget of {budget:g} seconds was asked for; expected a positive number of at most {LONGEST:g}, such as "
-            "60"
+            f"a budget of {budget:g} seconds was asked for; expected more than 0, up to {LONGEST:g}, such as 60"
         )
-    auto = registry.backend("auto")
-    light_left_out(scene, prepare(auto, scene), 0)  # compiles
-    begun = time.perf_counter()
+    auto = prepare(registry.backend("auto"), scene)
+    light_left_out(scene, auto, 0)  # compiles
+    clock = Budget(budget, time.perf_counter())
     asked = _unseen(scene, budget, seed)
     if not len(asked):
         raise BadInput("no isosurface of the range can be lit; expected a range within the data")
-    entrants, notes = ways(scene, asked, budget)
+    entrants, notes = tracers(scene, asked, budget)
+    probe = Probe.start(scene, auto, 256, 0.02, seed, 64)
+    bounces = probe.bounces_for(0.002)
+    references, pace = _references(scene, entrants, asked, budget, seed, notes)
+    by_surface = {surface: _tracer_of(entrants, surface) for surface in references}
+    _sharpen(references, by_surface, dict.fromkeys(references, 4 * GOAL), 0.3 * REFERENCES * budget)
+    main = next(iter(references))
+    flip = _camera(studio, scene, by_surface[main], references[main], seed, PICTURE * budget / pace)
+    race = Race(
+        scene, references, methods([m for m in entrants if m.surface in references]), sizes(scene), bounces, seed
+    )
+    notes += _show_default(race, *default, budget)
 
-    def tell(what: str = "race") -> None:
-        progress(what, min(int(time.perf_counter() - begun), int(budget)), int(budget))
+    def report() -> None:
+        progress("race", min(int(clock.spent()), int(budget)), int(budget))
 
-    pilot = Pilot.start(scene, auto, 256, 0.02, seed, 64)
-    bounces = pilot.bounces_for(0.002)
-    most = enough(scene, auto, 2e-4, seed)
-    tracers: dict[str, Backend] = {}
-    for way in sorted(entrants, key=lambda way: (way.surface != "levelset", way.slow)):
-        tracers.setdefault(way.surface, way.backend)
-    truths: dict[str, Truth] = {}
-    pace: dict[str, float] = {}
-    for surface, tracer in tracers.items():
-        tracing = time.perf_counter()
-        if truths:  # meshes may take longer to build than rays to cast: try one level set
-            rows = np.unique(asked.level, axis=0)
-            begin(scene, tracer, asked[(asked.level == rows[len(rows) // 2]).all(axis=1)], most, seed, 64)
-            takes = (time.perf_counter() - tracing) * len(rows)
-            if takes > OTHER * budget:
-                notes.append(f"what traces the {surface} takes no part: its truth alone would take {takes:.0f} s")
-                continue
-            tracing = time.perf_counter()
-        truth = begin(scene, tracer, asked, most, seed, 64)
-        spent = time.perf_counter() - tracing
-        if len(truth):
-            pace[surface] = spent / (64 * len(asked))
-            truths[surface] = _thinned(truth, surface, spent, TRUTH * budget / len(tracers), seed)
-    _grown(truths, tracers, scene, seed, dict.fromkeys(truths, 4 * GOAL), 0.3 * TRUTH * budget)
-    main = "levelset" if "levelset" in truths else next(iter(truths))
-    studio = Studio.open(scene, tracers[main], truths[main], seed, PICTURE * budget / pace[main])
-    race = Race(scene, truths, [way for way in entrants if way.surface in truths], sizes(scene), bounces, seed)
-    racing = (1 - 0.7 * TRUTH - PARTS) * budget
-    notes += _show_default(race, *(default or (default_grid(scene), PATHS)), budget)
-    while lane := race.next(racing - (time.perf_counter() - begun)):
-        race.step(lane)
-        tell()
+    racing = 1 - 0.7 * REFERENCES - PARTS
+    while contestant := race.next(clock.left(racing)):
+        race.advance(contestant)
+        report()
     if not race.points:
         raise BadInput("no contestant could finish; " + "; ".join(notes + race.notes))
-    race.repeat(begun + racing, tell, studio)
-    least = {s: min((p.rmse(truths[s]) for p in race.points if p.way.surface == s), default=1.0) for s in truths}
-    asked_for = {surface: error / 5 for surface, error in least.items()}
-    _grown(truths, tracers, scene, seed, asked_for, budget * (1 - PARTS) - (time.perf_counter() - begun))
-    race.repeat(begun + (1 - PARTS) * budget, tell, studio)  # what the truth did not need goes into missing seeds
-    parts = bars(scene, auto, sizes(scene), bounces, seed, budget - (time.perf_counter() - begun), pace[main])
-    best = tuple(front(race.points, truths))
-    return Report(
-        tuple(race.points), best, truths, tuple(parts), bounces, (*notes, *race.notes, *_remarks(best, truths)),
-        time.perf_counter() - begun,
-    )  # fmt: skip
+    race.repeat(clock.begun + racing * budget, report, flip)
+    _sharpen(
+        references, by_surface, {s: e / 5 for s, e in _least(race.points, references).items()}, clock.left(1 - PARTS)
+    )
+    race.repeat(clock.begun + (1 - PARTS) * budget, report, flip)  # what the reference did not need: missing seeds
+    parts = measure_parts(scene, auto, sizes(scene), bounces, seed, clock.left(), pace)
+    best = tuple(front(race.points, references))
+    notes += [*race.notes, *_remarks(best, references)]
+    return Report(tuple(race.points), best, references, tuple(parts), bounces, tuple(notes), clock.spent())
 
 
-def _show_default(race: Race, grid: int, paths: int, budget: float) -> list[str]:
-    """Chart `run`'s default; if it would take too much of the budget, as it is foreseen."""
-    own = registry.backend("auto")
-    entrants = [lane.run.way for lane in race.lanes if lane.run.way.surface == "levelset"]
-    way = next((w for w in entrants if w.sampler == Direct() and w.backend.name == own.name), None)
-    nearest = next((i for i in way.interpolators if i.name == "nearest"), None) if way else None
-    if way is None or nearest is None:
+def _unseen(scene: Scene, budget: float, seed: int) -> Queries:
+    """Points of the references: as many level sets as a small share of the budget allows, of 40 to 100 points."""
+    for points in (8, 64):  # the first one loads what extracts surfaces
+        begun = time.perf_counter()
+        unseen_on_level_sets(scene, 1, points, seed)
+        one = time.perf_counter() - begun
+    levels = int(np.clip(0.05 * budget / one, 8, 48))
+    return unseen_on_level_sets(scene, levels, int(np.clip(100 * levels, 1200, 4000)), seed)
+
+
+def _tracer_of(entrants: Sequence[Method], surface: str) -> Tracer:
+    """The fastest tracer of a surface that computes its reference: a plugin's only where the package has none."""
+    return min((m for m in entrants if m.surface == surface), key=lambda m: (not m.own, m.slow)).tracer
+
+
+def _references(
+    scene: Scene, entrants: Sequence[Method], asked: Queries, budget: float, seed: int, notes: list[str]
+) -> tuple[dict[str, Reference], float]:
+    """References by surface, level sets first, with 64 paths; and seconds for a path of the first."""
+    found: dict[str, Reference] = {}
+    pace = 0.0
+    surfaces = sorted({method.surface for method in entrants})
+    most = enough(scene, _tracer_of(entrants, surfaces[0]), 2e-4, seed)
+    for surface in surfaces:
+        tracer, begun = _tracer_of(entrants, surface), time.perf_counter()
+        if found:  # meshes may take longer to build than rays to cast: try one level set
+            rows = np.unique(asked.level, axis=0)
+            begin(tracer, asked[(asked.level == rows[len(rows) // 2]).all(axis=1)], most, seed)
+            takes = (time.perf_counter() - begun) * len(rows)
+            if takes > OTHER * budget:
+                notes.append(f"backends of the {surface} do not compete: their reference would take {takes:.0f} s")
+                continue
+            begun = time.perf_counter()
+        reference = begin(tracer, asked, most, seed)
+        spent = time.perf_counter() - begun
+        if len(reference):
+            pace = pace or spent / (64 * len(asked))
+            found[surface] = _thinned(reference, surface, spent, REFERENCES * budget / len(surfaces), seed)
+    return found, pace
+
+
+def _thinned(reference: Reference, surface: str, spent: float, left: float, seed: int) -> Reference:
+    """As many points of a reference, which took so many seconds, as can be sharpened to GOAL in the time left."""
+    takes = spent * (reference.error / GOAL) ** 2
+    keep = int(np.clip(len(reference) * left / max(takes, 1e-9), min(FEWEST, len(reference)), len(reference)))
+    chosen = np.sort(np.random.default_rng((seed, 4)).permutation(len(reference))[:keep])
+    return replace(reference[chosen], surface=surface)
+
+
+def _sharpen(
+    references: dict[str, Reference], by_surface: dict[str, Tracer], error: dict[str, float], left: float
+) -> None:
+    """Walk more paths in place until the references' own errors are small enough or the time is over.
+
+    The first, which judges most, comes last: it has what the others leave.
+    """
+    end = time.perf_counter() + left
+    for rest, (surface, reference) in zip(range(len(references), 0, -1), reversed(list(references.items()))):
+        spent, begun = 0.0, time.perf_counter()
+        until = begun + (end - begun) / rest
+        while (
+            reference.error > error[surface] and time.perf_counter() + 2 * spent < until and reference.paths < 1 << 15
+        ):
+            step = time.perf_counter()
+            reference = converge(reference, by_surface[surface], 0.0, 2 * reference.paths)
+            spent = time.perf_counter() - step
+        references[surface] = reference
+
+
+def _least(points: Sequence[Point], references: dict[str, Reference]) -> dict[str, float]:
+    """Least error on each surface."""
+    return {
+        surface: min((p.rmse(reference) for p in points if p.method.surface == surface), default=1.0)
+        for surface, reference in references.items()
+    }
+
+
+def _camera(
+    studio: Studio | None, scene: Scene, tracer: Tracer, reference: Reference, seed: int, paths: float
+) -> Flip | None:
+    if studio is None:
+        return None
+    albedo = np.array([field.material.albedo for field in scene.fields])[reference.queries.target]
+    return studio(scene, tracer, reference.light * albedo / np.pi, reference.bounces, seed, paths)
+
+
+def _show_default(race: Race, grid: int | None, paths: int, budget: float) -> list[str]:
+    """Chart `run`'s default; if it would take too much of the budget, predict it."""
+    own = registry.auto_backend()
+    entrants = [c.run.method for c in race.contestants if c.run.method.surface == "levelset"]
+    method = next((m for m in entrants if m.sampler == Direct() and m.backend.name == own), None)
+    nearest = next((i for i in method.interpolators if i.name == "nearest"), None) if method else None
+    if method is None or nearest is None:
         return []
-    begun, pace = time.perf_counter(), timed(race.scene, own, grid, 16, race.bounces, race.seed)
+    shapes = {max(spec.shape) for spec in specs_over(race.scene, grid)}
+    grid = shapes.pop() if len(shapes) == 1 else grid  # else fields of different size, each with its own default
+    begun = time.perf_counter()
+    pace = measure_pace(race.scene, method.tracer, specs_over(race.scene, grid), 16, race.bounces, race.seed)
 
-    def nodes(size: int) -> int:
-        return sum(len(reachable(f, spec)) for f, spec in zip(race.scene.fields, specs_of(race.scene, size)))
+    def seconds(size: int | None, count: int) -> float:
+        fields = zip(race.scene.fields, specs_over(race.scene, size))
+        return pace.seconds(sum(len(reachable(field, spec)) for field, spec in fields), count)
 
-    takes = pace.seconds(nodes(grid), paths)
+    takes = seconds(grid, paths)
     if takes <= DEFAULT * budget:
-        race.show_default(way, nearest, grid, paths)
+        race.show_default(method, nearest, grid, paths)
         return []
-    race.foresee(way, nearest, grid, paths, takes, default=True)
-    lit = {size: nodes(size) for size in race.sizes[1:]}
-    more = [(pace.seconds(lit[size], count), size, count) for size in lit for count in (8, 32, 128)]
-    for seconds, size, count in sorted(more):
+    race.predict(method, nearest, grid, paths, takes, default=True)
+    more = [(seconds(size, count), size, count) for size in race.sizes[1:] for count in (8, 32, 128)]
+    for takes, size, count in sorted(more):
         # As many nodes as those of the default, and as many seeds.
-        will = SEEDS * count * pace.path * 8 * len(race.truths["levelset"])
-        if (size, count) != (grid, paths) and time.perf_counter() - begun + will < FORESEEN * budget:
-            race.foresee(way, nearest, size, count, seconds)
-    return ["with ~ is what would take too much of the budget: its seconds are predicted, and of its nodes only those "
-            "around the points of the truth were lit"]  # fmt: skip
+        will = SEEDS * count * pace.path * 8 * len(race.references["levelset"])
+        if (size, count) != (grid, paths) and time.perf_counter() - begun + will < PREDICTED * budget:
+            race.predict(method, nearest, size, count, takes)
+    return ["~ marks predicted times: only the nodes near reference points were computed"]
 
 
-def _remarks(best: tuple[Point, ...], truths: dict[str, Truth]) -> list[str]:
-    """What a reader of the chart must know about how sure it is."""
-    told = []
-    for surface, truth in truths.items():
-        own = [p.rmse(truth) for p in best if p.way.surface == surface]
-        if own and truth.error > min(own) / 5:
-            told.append(
-                f"the truth of the {surface} is itself {truth.error:.2%} off, more than a fifth of the smallest error "
-                f"that it judges, {min(own):.2%}; its variance is subtracted, and a larger budget sharpens it"
+def measure_parts(
+    scene: Scene, tracer: Tracer, sizes: Sequence[int], bounces: int, seed: int, seconds: float, path: float
+) -> list[Measured]:
+    """Parts of the error on grids of these sizes, until `seconds` are used; `path` is the measured time per path.
+
+    At as many points as half of the time allows: where a few of them carry the error, few points miss those.
+    """
+    begun, last = time.perf_counter(), 0.0
+    each = path * (2 * 8 * sum(PARTS_PATHS) * len(sizes) + 2 * PARTS_REFERENCE)
+    points = int(np.clip(seconds / 2 / each, *PARTS_POINTS))
+    probe = Probe.start(scene, tracer, points, 0.004, shifted_seed(seed, 1), PARTS_REFERENCE)
+    fewer, found = probe.fewer(bounces), list[Measured]()
+    for paths in PARTS_PATHS:
+        for size in sizes:
+            now = time.perf_counter()
+            if now - begun + last > seconds and found:
+                break
+            found.append(probe.measure(specs_over(scene, size), fewer, paths))
+            last = (time.perf_counter() - now) * (4 if size == sizes[-1] else 1.5)
+    return sorted(found, key=lambda m: (m.grid, m.paths))
+
+
+def _remarks(best: Sequence[Point], references: dict[str, Reference]) -> list[str]:
+    """What a reader of the chart must know about how certain it is."""
+    found = []
+    for surface, reference in references.items():
+        own = [p.rmse(reference) for p in best if p.method.surface == surface]
+        if own and reference.error > min(own) / 5:
+            found.append(
+                f"the reference of the {surface} has an error of {reference.error:.2%}, more than a fifth of the "
+                f"smallest that it judges, {min(own):.2%}; its variance is subtracted, and a larger budget sharpens it"
             )
     if few := sum(len(p.seconds) < SEEDS for p in best):
-        told.append(f"{few} points of the front were run with fewer than {SEEDS} seeds: the budget was over")
-    return told
+        found.append(f"{few} points of the front were run with fewer than {SEEDS} seeds: the budget was over")
+    return found

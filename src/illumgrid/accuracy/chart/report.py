@@ -1,45 +1,37 @@
-"""A report as files and as text."""
+"""What a race showed: plain records, and which setting to use."""
 
-import csv
-import io
-import json
 import os
 import platform
+from collections.abc import Sequence
 from dataclasses import asdict
 from importlib.metadata import version
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from illumgrid.accuracy.chart import chart
-from illumgrid.accuracy.chart.told import advice, record, table
+import numpy as np
+
+from illumgrid.accuracy.chart import Report
+from illumgrid.accuracy.chart.race import Point
+from illumgrid.accuracy.reference import Reference, errors
 from illumgrid.field.scene import Scene
 
-if TYPE_CHECKING:
-    from illumgrid.accuracy.chart import Report
+Record = dict[str, Any]
+
+GOALS = (0.01, 0.03, 0.1)
+"""Relative errors for which a setting is recommended."""
+
+REMEDIES = {
+    "noise": "noise; increase --paths",
+    "grid": "interpolation between nodes; increase --grid, or pass --smooth 1 if the data are noisy",
+    "uncovered": "uncovered regions; increase --grid",
+    "bounces": "truncated bounces; increase --bounces",
+}
 
 
-def files(report: "Report", name: str, scene: Scene) -> tuple[dict[str, bytes], str]:
-    """Content of every file, and the text for the terminal."""
+def described(report: Report, name: str, scene: Scene) -> Record:
+    """All of a report, as JSON has it."""
     best = set(map(id, report.front))
-    records = [record(p, report.truths, id(p) in best) for p in report.points]
-    told = advice(records, report.bars, report.bounces)
-    figure = chart.draw(records, report.bars, f"{name}: {report.bounces} bounces, truth at {_points(report)} points")
-    content = {
-        "bench.json": json.dumps(_described(report, name, scene, records, told), indent=1).encode() + b"\n",
-        "bench.csv": _csv(records),
-        "chart.png": chart.image(figure, "png"),
-        "chart.svg": chart.image(figure, "svg"),
-    }
-    notes = [f"note: {note}" for note in report.notes]
-    return content, "\n".join([table(records), *notes, f"{name}: " + "; ".join(told)])
-
-
-def _points(report: "Report") -> int:
-    return max(len(truth) for truth in report.truths.values())
-
-
-def _described(
-    report: "Report", name: str, scene: Scene, records: list[dict[str, Any]], told: list[str]
-) -> dict[str, Any]:
+    records = [record(p, report.references, id(p) in best) for p in report.points]
+    parts = [{"nodes": m.grid, "paths": m.paths, **asdict(m.parts), "total": m.parts.total} for m in report.parts]
     return {
         "input": name,
         "fields": [
@@ -52,26 +44,93 @@ def _described(
         "versions": {package: version(package) for package in ("illumgrid", "numpy", "numba")},
         "truth": {
             surface: {
-                "points": len(truth),
-                "isovalues": len(set(truth.queries.level[:, 0].tolist())),
-                "paths": truth.paths,
-                "bounces": truth.bounces,
-                "mean": truth.mean,
-                "error": truth.error,
+                "points": len(reference),
+                "isovalues": len(set(reference.queries.level[:, 0].tolist())),
+                **{key: getattr(reference, key) for key in ("paths", "bounces", "mean", "error")},
             }
-            for surface, truth in report.truths.items()
+            for surface, reference in report.references.items()
         },
-        "advice": told,
+        "advice": advice(records, parts, report.bounces),
         "notes": list(report.notes),
         "points": records,
-        "parts": [{"grid": b.grid, "paths": b.paths, **asdict(b.split), "total": b.split.total} for b in report.bars],
+        "parts": parts,
     }
 
 
-def _csv(records: list[dict[str, Any]]) -> bytes:
-    text = io.StringIO()
-    columns = [key for key in records[0] if key != "options"]
-    writer = csv.DictWriter(text, columns, extrasaction="ignore", lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(records)
-    return text.getvalue().encode()
+def record(point: Point, references: dict[str, Reference], on_front: bool) -> Record:
+    """A point of the chart as JSON and CSV have it; shares are of the mean light."""
+    method, filler = point.method, point.interpolator
+    stages = {"sampler": method.sampler, "backend": method.backend, "interpolator": filler}
+    each = [errors(light, references[method.surface]) for light in point.light]
+    several = len(each) > 1
+    return {
+        "contestant": point.label,
+        **{kind: stage.name for kind, stage in stages.items()},
+        "options": {kind: asdict(stage) for kind, stage in stages.items()},
+        "surface": method.surface,
+        "grid": point.longest,
+        "paths": point.paths,
+        "queries": point.queries,
+        "seeds": len(each),
+        "seconds": point.time,
+        "seconds_spread": float(np.std(point.seconds, ddof=1)) if several else None,
+        "rmse": float(np.mean([e.rmse for e in each])),
+        "rmse_spread": float(np.std([e.rmse for e in each], ddof=1)) if several else None,
+        **{key: float(np.mean([getattr(e, key) for e in each])) for key in ("median", "p95", "bias")},
+        "uncovered": float(1 - point.covered.mean()),
+        "flip": point.flip,
+        "memory_mb": point.memory,
+        "front": on_front,
+        "default": point.default,
+        "built": point.built,
+    }
+
+
+def options(record: Record, bounces: int) -> str:
+    """A setting as options of ``illumgrid run``."""
+    words = [f"--{kind} {record[kind]}" for kind in ("sampler", "backend", "interpolator")]
+    if count := record["options"]["sampler"].get("count"):
+        words.append(f"--isovalues {count}")
+    if record["options"]["backend"].get("surface") == "mesh":
+        words.append("--set backend.surface=mesh")
+    return " ".join([*words, f"--grid {record['grid']} --paths {record['paths']} --bounces {bounces}"])
+
+
+def advice(records: Sequence[Record], parts: Sequence[Record], bounces: int) -> list[str]:
+    """Which setting to use at each of the goals, in sentences."""
+    best = sorted((r for r in records if r["front"]), key=lambda r: r["seconds"])
+    found = []
+    for goal in GOALS:
+        if r := next((r for r in best if r["rmse"] <= goal), None):
+            found.append(f"for {goal:.0%} use {options(r, bounces)} ({cost(r)})")
+    found += [standing(r, best, bounces) for r in records if r["default"]]
+    last = best[-1]
+    if missed := [f"{goal:.0%}" for goal in GOALS if goal < last["rmse"]]:
+        found.append(
+            f"{' and '.join(missed)} was not reached within this budget; the nearest was {options(last, bounces)} "
+            f"({cost(last)}), whose error is dominated by {dominant(last, parts)}"
+        )
+    return found
+
+
+def cost(record: Record) -> str:
+    """Seconds and error of a setting."""
+    seconds = f"{record['seconds']:.0f}" if record["seconds"] >= 10 else f"{record['seconds']:.2g}"
+    return f"{'' if record['built'] else 'about '}{seconds} s, error {record['rmse']:.2%}"
+
+
+def standing(default: Record, best: Sequence[Record], bounces: int) -> str:
+    """Where `run`'s default stands against the front (from fast to accurate)."""
+    own = f"run's default ({cost(default)})"
+    if default["front"]:
+        return f"{own} is on the front"
+    better = min((r for r in best if r["seconds"] <= default["seconds"]), key=lambda r: r["rmse"])
+    return f"{own} is beaten by {options(better, bounces)} ({cost(better)})"
+
+
+def dominant(record: Record, parts: Sequence[Record]) -> str:
+    """The largest part of the error at a setting, and what lessens it."""
+    near = min(
+        parts, key=lambda p: (abs(np.log(p["nodes"] / record["grid"])), abs(np.log(p["paths"] / record["paths"])))
+    )
+    return REMEDIES[max(REMEDIES, key=lambda name: near[name])]

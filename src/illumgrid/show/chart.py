@@ -1,10 +1,8 @@
-"""The chart: seconds against error, and the parts of the error."""
+"""The speed-accuracy chart: seconds against error, and the parts of the error, drawn from the records of `bench`."""
 
 import io
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
-
-from illumgrid.accuracy.chart.whence import Bar
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -13,10 +11,10 @@ if TYPE_CHECKING:
 COLORS = ("#1b6ca8", "#d1495b", "#3c8d5a", "#b07d12", "#7a4fa3", "#2a9d9d", "#8c564b", "#555555")
 MARKERS = "osD^vP*X<>hd"
 PARTS = {
-    "noise": ("noise of the paths", "#8fb8de"),
-    "grid": ("between nodes", "#1b6ca8"),
-    "uncovered": ("no sample near", "#d1495b"),
-    "bounces": ("bounces left out", "#e0a030"),
+    "noise": ("noise", "#8fb8de"),
+    "grid": ("interpolation between nodes", "#1b6ca8"),
+    "uncovered": ("uncovered", "#d1495b"),
+    "bounces": ("truncated bounces", "#e0a030"),
 }
 SHOWN = 10
 """Contestants with a colour of their own; the others are grey."""
@@ -28,7 +26,7 @@ LABEL = (45.0, 11.0)
 """Pixels that a label takes."""
 
 
-def draw(records: Sequence[dict[str, Any]], bars: Sequence[Bar], title: str) -> "Figure":
+def draw(records: Sequence[dict[str, Any]], shares: Sequence[dict[str, Any]], title: str) -> "Figure":
     """Figure with the race on the left, and where the error of the direct way comes from on the right."""
     from matplotlib.figure import Figure
 
@@ -36,7 +34,7 @@ def draw(records: Sequence[dict[str, Any]], bars: Sequence[Bar], title: str) -> 
     figure = Figure(figsize=(13, 6 + 0.17 * rows), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=(1.55, 1))
     race(left, records)
-    parts(right, bars)
+    parts(right, shares)
     handles, names = left.get_legend_handles_labels()  # below both: however many there are, they hide nothing
     figure.legend(handles, names, loc="outside lower center", ncols=COLUMNS, fontsize=8, frameon=False)
     figure.suptitle(title, fontsize=12)
@@ -54,7 +52,7 @@ def race(axes: "Axes", records: Sequence[dict[str, Any]]) -> None:
     names = sorted(best, key=lambda name: (not best[name][0], best[name][1]))
     front = sorted((r for r in records if r["front"]), key=lambda r: r["seconds"])
     axes.step([r["seconds"] for r in front], [100 * r["rmse"] for r in front], where="post", color="#999999",
-              linewidth=6, alpha=0.35, zorder=1, label="nobody is faster and better")  # fmt: skip
+              linewidth=6, alpha=0.35, zorder=1, label="Pareto front")  # fmt: skip
     for k, name in enumerate(names):
         own = sorted((r for r in records if r["contestant"] == name), key=lambda r: r["seconds"])
         color = COLORS[k % len(COLORS)] if k < SHOWN else "#bbbbbb"
@@ -83,7 +81,7 @@ def race(axes: "Axes", records: Sequence[dict[str, Any]]) -> None:
 
 
 def labelled(axes: "Axes", front: Sequence[dict[str, Any]]) -> None:
-    """Nodes x paths below the points of the front, or above where another label is in the way; once for all fillers."""
+    """Label the front's points with nodes x paths, below, or above where another label is in the way."""
     axes.autoscale_view()
     last, taken = "", [(float("-inf"), 0.0)]
     for r in front:
@@ -100,35 +98,33 @@ def labelled(axes: "Axes", front: Sequence[dict[str, Any]]) -> None:
                       zorder=5)  # fmt: skip
 
 
-def parts(axes: "Axes", bars: Sequence[Bar]) -> None:
+def parts(axes: "Axes", shares: Sequence[dict[str, Any]]) -> None:
     """Mean squared error in parts, stacked so that a bar is as high as the root of their sum; a tick is the total."""
-    place, ticks, at, last = [], [], 0.0, None
-    for bar in bars:
-        at += 1.0 if bar.grid == last or last is None else 1.7
-        last = bar.grid
-        place.append(at)
-        ticks.append(f"{bar.paths}")
-    base = [0.0] * len(bars)
+    place: list[float] = []
+    base = [0.0] * len(shares)
+    for share, before in zip(shares, [None, *shares]):
+        same = before is None or share["nodes"] == before["nodes"]
+        place.append((place[-1] if place else 0.0) + (1.0 if same else 1.7))
     for part, (name, color) in PARTS.items():
         heights = []
-        for bar in bars:
-            squares = {p: max(0.0, getattr(bar.split, p)) for p in PARTS}
+        for share in shares:
+            squares = {p: max(0.0, share[p]) for p in PARTS}
             whole = sum(squares.values())
             heights.append(100 * squares[part] / whole**0.5 if whole > 0 else 0.0)
         axes.bar(place, heights, bottom=base, width=0.85, color=color, label=name)
         base = [b + h for b, h in zip(base, heights)]
-    total = [100 * bar.split.total**0.5 for bar in bars]
+    total = [100 * share["total"] ** 0.5 for share in shares]
     reach = [
-        [t - 100 * max(0.0, bar.split.total - bar.split.uncertain) ** 0.5 for t, bar in zip(total, bars)],
-        [100 * (bar.split.total + bar.split.uncertain) ** 0.5 - t for t, bar in zip(total, bars)],
+        [t - 100 * max(0.0, share["total"] - share["uncertain"]) ** 0.5 for t, share in zip(total, shares)],
+        [100 * (share["total"] + share["uncertain"]) ** 0.5 - t for t, share in zip(total, shares)],
     ]
     axes.errorbar(place, total, yerr=reach, fmt="_", markersize=15, color="black", elinewidth=1, capsize=2,
-                  label="all of it, as judged by the truth")  # fmt: skip
+                  label="total, against the reference")  # fmt: skip
     axes.set_ylim(0, 1.25 * max([*base, *(t + up for t, up in zip(total, reach[1])), 1e-9]))
-    axes.set_xticks(place, ticks, fontsize=8)
-    for grid in sorted({bar.grid for bar in bars}):
-        own = [x for x, bar in zip(place, bars) if bar.grid == grid]
-        axes.annotate(f"{grid} nodes", (sum(own) / len(own), 0), xycoords=("data", "axes fraction"), xytext=(0, -20),
+    axes.set_xticks(place, [f"{share['paths']}" for share in shares], fontsize=8)
+    for nodes in sorted({share["nodes"] for share in shares}):
+        own = [x for x, share in zip(place, shares) if share["nodes"] == nodes]
+        axes.annotate(f"{nodes} nodes", (sum(own) / len(own), 0), xycoords=("data", "axes fraction"), xytext=(0, -20),
                       textcoords="offset points", ha="center", va="top", fontsize=9)  # fmt: skip
     axes.set_xlabel("paths, and nodes along the longest axis", labelpad=20)
     axes.set_ylabel("relative RMS error, %")

@@ -1,0 +1,93 @@
+"""What can be compared: every sampler with every backend and every interpolator that is available here."""
+
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from illumgrid import registry
+from illumgrid.errors import BadInput
+from illumgrid.field.scene import Scene
+from illumgrid.stages import Backend, Interpolator
+from illumgrid.transport.samples import Queries
+from illumgrid.transport.tracer import Tracer, prepare
+
+COUNTS = (8, 32, 128)  # level sets that a sampler with the option ``count`` tries
+SLOWEST = 0.005  # share of the budget that a backend may take for 64 queries and 4 paths
+
+
+@dataclass(frozen=True, eq=False)
+class Method:
+    """A way to make samples, and all that may fill the grid from them."""
+
+    sampler: Any  # a Sampler, once it is known
+    backend: Backend
+    tracer: Tracer
+    surface: str  # what stands for the level sets: "levelset" or "mesh"
+    interpolators: tuple[Interpolator, ...]
+    denser: "Method | None" = None  # the same with more level sets, tried after this one
+    slow: float = 1.0  # what the backend takes, over what the fastest one takes
+    own: bool = True  # whether the backend is of this package and not a plugin's
+
+    def label(self, interpolator: Interpolator) -> str:
+        """Name of a contestant, as the chart shows it."""
+        count = getattr(self.sampler, "count", None)
+        sampler = self.sampler.name if count is None else f"{self.sampler.name} {count}"
+        surface = f" ({self.surface})" if hasattr(self.backend, "surface") else ""
+        return f"{sampler}, {self.backend.name}{surface}, {interpolator.name}"
+
+
+def _stages(kind: str) -> Iterator[Any]:
+    """Every stage of a kind with its default options; what is not available here is passed over."""
+    for entry in registry.entries():
+        if entry.kind == kind and entry.missing() is None:
+            try:
+                yield registry.make(kind, entry.name, {})
+            except (BadInput, ImportError):  # two packages claim the name, or something is missing after all
+                continue
+
+
+def tracers(scene: Scene, asked: Queries, budget: float) -> tuple[list[Method], list[str]]:
+    """Backends on each of their surfaces, as methods that lack a sampler and are warm; and why others are left out.
+
+    The fastest one is never too slow.
+    """
+    found, notes = [], []
+    few = asked[: min(64, len(asked))]
+    few = few[np.flatnonzero((few.level == few.level[0]).all(axis=1))]  # a mesh is made for each level set
+    for _, backend, can in registry.backends():
+        if not can.transport:
+            notes.append(f"{backend.name} does not compete: it computes no light transport, so no reference judges it")
+            continue
+        try:
+            tracer = prepare(backend, scene)
+            for some in (few[:1], few):  # compiled and built in the first
+                begun = time.perf_counter()
+                tracer.solve(some, paths=range(4), bounces=2, seed=0)
+        except BadInput as reason:
+            notes.append(f"{backend.name} does not compete: {reason}")
+            continue
+        spent = (time.perf_counter() - begun) * 64 / len(few)
+        own = registry.entry("backend", backend.name).package == "illumgrid"
+        found.append(Method(None, backend, tracer, can.surface, (), slow=spent, own=own))
+    fastest = min((method.slow for method in found), default=1.0)
+    late = [method for method in found if method.slow > max(SLOWEST * budget, fastest)]
+    notes += [f"{m.backend.name} does not compete: 64 queries with 4 paths took {m.slow:.2f} s" for m in late]
+    return [replace(m, slow=m.slow / fastest) for m in found if m not in late], notes
+
+
+def methods(tracers: Sequence[Method]) -> list[Method]:
+    """Every sampler and interpolator with each of the `tracers`, with the fewest level sets each."""
+    found = []
+    interpolators = tuple(_stages("interpolator"))
+    for sampler in _stages("sampler"):
+        for tracer in tracers:
+            method = replace(tracer, sampler=sampler, interpolators=interpolators)
+            if hasattr(sampler, "count"):
+                denser = None
+                for count in COUNTS[::-1]:
+                    denser = method = replace(method, sampler=replace(sampler, count=count), denser=denser)
+            found.append(method)
+    return found

@@ -1,0 +1,51 @@
+"""The error that a finished run has reached, and what would lessen it."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from illumgrid.accuracy.points import unseen_in_volume
+from illumgrid.accuracy.probe import Probe
+from illumgrid.accuracy.reference import Errors, begin, enough, errors, look_up
+from illumgrid.bake import shifted_seed
+from illumgrid.errors import BadInput
+from illumgrid.field.lattice import specs_over
+from illumgrid.field.scene import Scene
+from illumgrid.field.volume import smooth
+from illumgrid.grid import GridSpec, IlluminationGrid
+from illumgrid.stages import Backend
+from illumgrid.transport.tracer import Tracer, prepare
+
+
+def judge(
+    scene: Scene, tracer: Tracer, grids: Sequence[IlluminationGrid], seed: int, queries: int, paths: int, bounces: int
+) -> Errors | None:
+    """Error of grids at points that neither they nor the probe asked for; None where there is no light or no surface.
+
+    For a twentieth of the run's work, or what 1024 points take: as many paths as the grids had, which makes the
+    reference as sharp as they are, and the more points, for where the light is rough a few of them carry the error.
+    The path count is fixed in advance; stopping once the reference looks sharp enough would bias the estimate.
+    """
+    followed = enough(scene, tracer, 1e-3, seed)
+    work = queries * paths * (bounces + 1) / (20 * (followed + 1))
+    points = int(np.clip(work / max(paths, 1), 1024, 4096))
+    many = 2 ** round(np.log2(np.clip(work / points, 32, max(32, paths))))
+    own = shifted_seed(seed, 2)
+    reference = begin(tracer, unseen_in_volume(scene, points, own), followed, own, many)
+    return errors(look_up(grids, reference.queries), reference) if reference.mean > 0 else None
+
+
+def remedies(scene: Scene, backend: Backend, specs: Sequence[GridSpec], bounces: int, seed: int) -> dict[str, float]:
+    """Relative error without noise of grids as they are, of `--grid` with twice the nodes, and of a smoothed field."""
+    soft = replace(scene, fields=tuple(replace(f, volume=smooth(f.volume, 1.0)) for f in scene.fields))
+    longest = max(max(spec.shape) for spec in specs)
+    finer, found = specs_over(scene, 2 * longest), {}
+    for what, of, nodes in (("now", scene, specs), ("finer", scene, finer), ("smooth", soft, specs)):
+        try:  # few points and paths: a hint must not cost more than the run
+            probe = Probe.start(of, prepare(backend, of), 512, 0.05, seed, most=128)
+        except BadInput:  # no light where it looked
+            return {}
+        part = probe.measure(nodes, probe.fewer(bounces), 32).parts
+        found[what] = float(np.sqrt(max(0.0, part.total - part.noise)))
+    return found

@@ -1,0 +1,164 @@
+"""Converged light at points that nobody asked for, and how far a grid is from it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from illumgrid.accuracy.points import other_paths
+from illumgrid.bake import Bake, light_left_out, shifted_seed
+from illumgrid.field.scene import Scene
+from illumgrid.field.volume import Floats
+from illumgrid.grid import IlluminationGrid
+from illumgrid.transport.samples import Queries
+from illumgrid.transport.tracer import Tracer
+
+MOST_BOUNCES = 128
+
+
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """Light at unseen points, with its own error: how far two halves from independent seeds differ.
+
+    The error bars of the samples would not do: they are made to cover, and where light comes by few paths that is more.
+
+    Parameters
+    ----------
+    halves : (Bake, Bake)
+        One batch of points each, without holes; as many paths in both.
+    surface : str
+        The stand-in for the level sets that the light met: "levelset" (trilinear) or "mesh" (marching cubes).
+    """
+
+    halves: tuple[Bake, Bake]
+    surface: str = "levelset"
+
+    def __len__(self) -> int:
+        return len(self.queries)
+
+    def __getitem__(self, rows: Any) -> "Reference":
+        """Some of the points, by a slice, numbers or a mask."""
+        one, other = (
+            replace(h, targets=(h.targets[0][rows],), answers=tuple(a[rows] for a in h.answers)) for h in self.halves
+        )
+        return replace(self, halves=(one, other))
+
+    @property
+    def queries(self) -> Queries:
+        """The points."""
+        return self.halves[0].targets[0]
+
+    @property
+    def bounces(self) -> int:
+        """Reflections that were followed."""
+        return self.halves[0].bounces
+
+    @property
+    def paths(self) -> int:
+        """Paths from each point, of both halves."""
+        return 2 * self.halves[0].paths
+
+    @property
+    def light(self) -> Floats:
+        """Irradiance (n, 3)."""
+        one, other = (half.samples.mean for half in self.halves)
+        return (one.astype(float) + other) / 2
+
+    @property
+    def off(self) -> Floats:
+        """Half the difference (n, 3) of the halves: its square has the variance of `light` for its expectation."""
+        one, other = (half.samples.mean for half in self.halves)
+        return (one.astype(float) - other) / 2
+
+    @property
+    def mean(self) -> float:
+        """Mean irradiance over points and colours, to which errors are relative; 0 without points."""
+        return float(self.light.mean()) if len(self) else 0.0
+
+    @property
+    def error(self) -> float:
+        """Root mean square error of the reference itself, relative to the mean irradiance; 0 in the dark."""
+        return float(np.sqrt((self.off**2).mean())) / self.mean if self.mean > 0 else 0.0
+
+    def walk(self, tracer: Tracer, paths: range) -> "Reference":
+        """Walk these paths as well, half of them with each seed; the limits are even."""
+        half = range(paths.start // 2, paths.stop // 2)
+        one, other = (h.walk(tracer, half) for h in self.halves)
+        return replace(self, halves=(one, other))
+
+    def cut_off(self, tracer: Tracer, bounces: int) -> "Reference":
+        """The same paths, ended after fewer bounces."""
+        one, other = (Bake.of(h.targets, min(bounces, self.bounces), h.seed) for h in self.halves)
+        return replace(self, halves=(one, other)).walk(tracer, range(self.paths))
+
+
+def enough(scene: Scene, tracer: Tracer, tolerance: float, seed: int) -> int:
+    """Reflections beyond which less than `tolerance` of all light is left out."""
+    bounces = 8
+    while bounces < MOST_BOUNCES and light_left_out(scene, tracer, bounces, seed) > tolerance:
+        bounces *= 2
+    return bounces
+
+
+def begin(tracer: Tracer, asked: Queries, bounces: int, seed: int, paths: int = 64) -> Reference:
+    """Trace a few paths that no run of `seed` walks; points inside another field's solid are left out."""
+    one, other = (Bake.of([asked], bounces, shifted_seed(other_paths(seed), k * 2**61)) for k in (0, 1))
+    found = Reference((one, other)).walk(tracer, range(paths))
+    return found[found.halves[0].samples.paths > 0]
+
+
+def converge(reference: Reference, tracer: Tracer, error: float, most: int = 1 << 14) -> Reference:
+    """Go on until the reference's own relative error is at most `error`, or `most` paths from each point are spent."""
+    while len(reference) and reference.error > error and reference.paths < most:
+        reference = reference.walk(tracer, range(reference.paths, 2 * reference.paths))
+    return reference
+
+
+@dataclass(frozen=True)
+class Errors:
+    """How far a grid is from the reference, all relative to the mean irradiance.
+
+    Parameters
+    ----------
+    rmse : float
+        Root mean square over points and colours, the reference's own variance subtracted; at least a third of the
+        reference's own error, below which an error cannot be distinguished from none.
+    uncertain : float
+        Standard error of `rmse`, from the spread over the points.
+    median, p95 : float
+        Median and 95th percentile over points of the root mean square over colours.
+    bias : float
+        Mean difference; below 0 the grid is too dark.
+    """
+
+    rmse: float
+    uncertain: float
+    median: float
+    p95: float
+    bias: float
+
+
+def look_up(grids: Sequence[IlluminationGrid], asked: Queries) -> Floats:
+    """Light (n, 3) that the grids hold at the points of queries, each in the grid of its field."""
+    light = np.zeros((len(asked), 3))
+    for number, grid in enumerate(grids):
+        own = asked.target == number
+        light[own] = grid.lookup(asked.point[own])
+    return light
+
+
+def errors(light: Floats, reference: Reference) -> Errors:
+    """How far `light` (n, 3), looked up at the points of a reference, is from it."""
+    off = (light - reference.light) / reference.mean
+    square = (off**2).mean(axis=1)
+    each, own = np.sqrt(square), reference.error
+    rmse = float(np.sqrt(max(own**2 / 9, square.mean() - own**2)))
+    spread = float(square.std() / np.sqrt(len(square)))
+    return Errors(
+        rmse=rmse,
+        uncertain=spread / (2 * rmse) if rmse > 0 else 0.0,
+        median=float(np.median(each)),
+        p95=float(np.quantile(each, 0.95)),
+        bias=float(off.mean()),
+    )
