@@ -10,6 +10,8 @@ break_even
     Number of isovalues from which a grid is cheaper than path tracing each isosurface anew at equal error.
 volumes
     `bench` on real volumes (charts as PNG beside the JSON file), and `run`'s default relative to the Pareto front.
+judgements
+    Errors that `run` reports for one grid, over twelve seeds, where light comes by few paths.
 defaults
     The default nodes and paths of `run` compared with others, `direct` with `nearest`, on real volumes.
 
@@ -22,20 +24,24 @@ import json
 import os
 import time
 import warnings
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from rays import gaussians
 
 from illumgrid import Queries, Scene, Volume, backend, isosurface, read_volume, run
-from illumgrid.accuracy.chart import bench, report, sizes
-from illumgrid.accuracy.chart.contestants import ways as every_way
+from illumgrid.accuracy.chart import bench, sizes
+from illumgrid.accuracy.chart.methods import methods, tracers
 from illumgrid.accuracy.chart.race import SEEDS, Race, front
 from illumgrid.accuracy.choose import planned
-from illumgrid.accuracy.truth import begin, converge, errors, look_up, trace, unseen_on_level_sets
+from illumgrid.accuracy.judge import judge
+from illumgrid.accuracy.points import unseen_in_volume, unseen_on_level_sets
+from illumgrid.accuracy.reference import begin, converge, errors, look_up
+from illumgrid.bake import Bake
+from illumgrid.cli.bench import files
 from illumgrid.field.scene import level_table
 from illumgrid.field.volume import smooth
+from illumgrid.transport.tracer import prepare
 
 ROOT = Path(__file__).resolve().parents[1]
 BOUNCES = 6
@@ -69,7 +75,8 @@ def fields():
 
 def truth_of(scene, error=0.002, levels=40, points=8000, bounces=32, paths=4096):
     asked = unseen_on_level_sets(scene, levels, points, 77)
-    return converge(begin(scene, backend("numba"), asked, bounces, 77), scene, backend("numba"), 77, error, paths)
+    tracer = prepare(backend("numba"), scene)
+    return converge(begin(tracer, asked, bounces, 77), tracer, error, paths)
 
 
 def off(light, truth):
@@ -113,13 +120,13 @@ def targets(asked):
 def race_of(scene, budget):
     """A race with a fixed number of bounces, run to the end of its budget."""
     truth = truth_of(scene, 0.004, levels=24, points=2400, bounces=BOUNCES)
-    entrants, _ = every_way(scene, truth.queries, budget)
-    entrants = [way for way in entrants if way.backend.name == "numba" and way.surface == "levelset"]
-    race = Race(scene, {"levelset": replace(truth, bounces=BOUNCES)}, entrants, sizes(scene), BOUNCES, 0)
+    found, _ = tracers(scene, truth.queries, budget)
+    entrants = methods([m for m in found if m.backend.name == "numba" and m.surface == "levelset"])
+    race = Race(scene, {"levelset": truth}, entrants, sizes(scene), BOUNCES, 0)
     begun = time.perf_counter()
     # `bench` reserves time to repeat settings with more seeds, which is not done here.
     while setting := race.next(SEEDS * (budget - (time.perf_counter() - begun))):
-        race.step(setting)
+        race.advance(setting)
     return race
 
 
@@ -131,11 +138,11 @@ def stages(asked):
     found = {}
     for name, scene in cases.items():
         race = race_of(scene, 60 if asked.quick else 120)
-        exact = race.truths["levelset"]
+        exact = race.references["levelset"]
         curves = {}
         for p in race.points:
-            curves.setdefault(f"{p.way.sampler.name}, {p.interpolator.name}", []).append(p)
-        best_of = {label: front(points, race.truths) for label, points in sorted(curves.items())}
+            curves.setdefault(f"{p.method.sampler.name}, {p.interpolator.name}", []).append(p)
+        best_of = {label: front(points, race.references) for label, points in sorted(curves.items())}
         own = best_of["direct, nearest"]
         times, rmse = np.log([p.time for p in own]), np.log([p.rmse(exact) for p in own])
         for label, best in best_of.items():
@@ -182,14 +189,15 @@ def break_even(asked):
     found = {}
     for name, scene in cases.items():
         plan = planned(scene, backend("numba"), level_table(scene, 4), error=0.03, bounces=BOUNCES)
-        light, whole = timed(scene, grid=plan.grid, paths=plan.paths, bounces=BOUNCES, isovalues=4)
+        light, whole = timed(scene, judge=False, grid=plan.grid, paths=plan.paths, bounces=BOUNCES, isovalues=4)
         each, lookup = [], []
         for t in (0.2, 0.5, 0.8):
             level = float(scene.levels(t)[0, 0])
             vertices = isosurface(scene.fields[0].volume, level).vertices  # needed by both
             begun = time.perf_counter()
             points = Queries.at(scene, vertices, level=level)
-            one, other = trace(scene, backend("numba"), points, range(32), BOUNCES, 0)
+            tracer = prepare(backend("numba"), scene)
+            one, other = (Bake.of([points], BOUNCES, s).walk(tracer, range(16)).samples for s in (0, 1))
             tracing = (time.perf_counter() - begun) / 2
             noise = np.sqrt(((one.mean - other.mean)[one.paths > 0] ** 2).mean() / 2) / one.mean.mean()
             each.append(tracing * max(1.0, 16 * (noise / 0.03) ** 2) / 16)  # for the paths that equal the error
@@ -203,6 +211,21 @@ def break_even(asked):
     return found
 
 
+def judgements(asked):
+    """Reported errors of a grid in the box, where few paths carry the light, against a reference on other points."""
+    scene = fields()["in the box"]
+    tracer = prepare(backend("numba"), scene)
+    light = run(scene, grid=40, paths=128, bounces=8, seed=0, judge=False)
+    exact = converge(begin(tracer, unseen_in_volume(scene, 2000, 50), 32, 50), tracer, 0.02, 256)
+    about = light.recipe["queries"], 128, 8
+    reported = [judge(scene, tracer, light.grids, seed, *about) for seed in range(12)]
+    rmse, true = [e.rmse for e in reported], off(light, exact).rmse
+    uncertain = [e.uncertain for e in reported]
+    print(f"  error {true:.2%}; reported {min(rmse):.2%} to {max(rmse):.2%}, {np.mean(rmse):.2%} on average, spread "
+          f"{np.std(rmse, ddof=1):.2%}, reported uncertainty {np.mean(uncertain):.2%}")  # fmt: skip
+    return {"rmse": true, "reported": rmse, "uncertain": uncertain}
+
+
 def volumes(asked):
     """Charts of real volumes, and error and time of run's default relative to the front."""
     found = {}
@@ -211,17 +234,17 @@ def volumes(asked):
             continue
         scene = Scene.sky(read_volume(asked.volumes / name), range=limits)
         result = bench(scene, 40 if asked.quick else 80)
-        content, summary = report.files(result, name.split(".")[0], scene)
+        content, summary = files(result, name.split(".")[0], scene)
         (asked.json.parent / f"chart-{name.split('.')[0]}.png").write_bytes(content["chart.png"])
-        exact = result.truths["levelset"]
+        exact = result.references["levelset"]
         default = next(p for p in result.points if p.default)
         took, rmse = default.time, default.rmse(exact)
-        error = {p: p.rmse(result.truths[p.way.surface]) for p in result.points}
+        error = {p: p.rmse(result.references[p.method.surface]) for p in result.points}
         dominating = [p for p in result.front if p.time < took and error[p] < rmse]
         advice = summary.splitlines()[-1]
         found[name] = {
             "default": {"seconds": took, "built": default.built, "rmse": rmse, "dominated by": len(dominating)},
-            "truth": exact.error, "least": min(e for p, e in error.items() if p.way.surface == "levelset"),
+            "truth": exact.error, "least": min(e for p, e in error.items() if p.method.surface == "levelset"),
             "advice": advice,
         }  # fmt: skip
         better = [f"{p.label} {p.grid} x {p.paths} ({p.time:.1f} s, {error[p]:.2%})" for p in dominating]
@@ -245,7 +268,7 @@ def defaults(asked):
         truth = truth_of(scene, 0.01, levels=24, points=6000, paths=512)
         found[name] = []
         for density, paths in tried:
-            light, took = timed(scene, grid=round(density * longest), paths=paths, isovalues=4)
+            light, took = timed(scene, judge=False, grid=round(density * longest), paths=paths, isovalues=4)
             found[name].append((density, paths, took, off(light, truth).rmse))
         took = {(d, p): (t, e) for d, p, t, e in found[name]}
         own = took[1.2, 32]
@@ -254,7 +277,7 @@ def defaults(asked):
     return found
 
 
-PARTS = {part.__name__: part for part in (targets, stages, budgets, break_even, volumes, defaults)}
+PARTS = {part.__name__: part for part in (targets, stages, budgets, break_even, volumes, judgements, defaults)}
 
 
 def main():

@@ -14,10 +14,12 @@ from pathlib import Path
 import numpy as np
 
 import illumgrid as ig
-from illumgrid.accuracy.truth import begin, converge, errors, look_up, unseen_on_level_sets
+from illumgrid.accuracy.points import unseen_on_level_sets
+from illumgrid.accuracy.reference import begin, converge, errors, look_up
 from illumgrid.field.scene import Material, Scene
 from illumgrid.field.volume import Volume
 from illumgrid.transport.samples import join_queries
+from illumgrid.transport.tracer import prepare
 
 METHODS = {
     "direct": ("direct", "nearest"),
@@ -76,15 +78,15 @@ def lit(scene: Scene, method: str, levels: int = 12, paths: int = 32, grid: int 
     options = {} if sampler == "direct" else {"count": levels}
     return ig.run(
         scene, sampler=ig.sampler(sampler, **options), interpolator=interpolator, backend="numba", grid=grid,
-        paths=paths, bounces=3, isovalues=2,
+        paths=paths, judge=False, bounces=3, isovalues=2,
     )  # fmt: skip
 
 
 def judged(scene: Scene, grids: dict[str, "ig.Illumination"]) -> dict[str, float]:
     """Relative RMSE of each method at points on isovalues that no method visited."""
-    backend = ig.backend("numba")
+    tracer = prepare(ig.backend("numba"), scene)
     asked = unseen_on_level_sets(scene, 10, 400, 7)
-    truth = converge(begin(scene, backend, asked, 3, 7), scene, backend, 7, 0.005, 512)
+    truth = converge(begin(tracer, asked, 3, 7), tracer, 0.005, 512)
     return {name: errors(look_up(light.grids, truth.queries), truth).rmse for name, light in grids.items()}
 
 
@@ -121,7 +123,7 @@ def by_distance() -> Iterator[tuple[float, dict[str, float]]]:
     """Errors against the distance of the isovalue from a critical one, on both sides."""
     scene = pair()
     grids = {name: lit(scene, name) for name in METHODS}
-    backend = ig.backend("numba")
+    tracer = prepare(ig.backend("numba"), scene)
     for off in (0.002, 0.005, 0.01, 0.02, 0.05, 0.1):
         parts = []
         for level in (0.7 - off, 0.7 + off):
@@ -133,7 +135,7 @@ def by_distance() -> Iterator[tuple[float, dict[str, float]]]:
 
         asked = join_queries(parts)
         asked = asked[np.flatnonzero(asked.normal.any(axis=1))]
-        truth = converge(begin(scene, backend, asked, 3, 7), scene, backend, 7, 0.005, 512)
+        truth = converge(begin(tracer, asked, 3, 7), tracer, 0.005, 512)
         yield off, {n: errors(look_up(light.grids, truth.queries), truth).rmse for n, light in grids.items()}
 
 

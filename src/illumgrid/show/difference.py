@@ -8,14 +8,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from illumgrid import tone
 from illumgrid.bake import shifted_seed
 from illumgrid.field.scene import Scene, level_table
 from illumgrid.field.volume import Floats
 from illumgrid.grid import IlluminationGrid, WallTexture
 from illumgrid.light import Illumination
-from illumgrid.show.render import render
-from illumgrid.show.software import SIDE
+from illumgrid.show import render
+from illumgrid.show.engines.software import SIDE
 from illumgrid.transport.samples import Queries
 from illumgrid.transport.tracer import Tracer
 
@@ -48,7 +47,7 @@ class Traced:
 
 
 def studio(
-    scene: Scene, tracer: Tracer, radiance: Floats, bounces: int, seed: int, paths: float
+    scene: Scene, tracer: Tracer, exposure: float, bounces: int, seed: int, paths: float
 ) -> Callable[[list[IlluminationGrid]], float] | None:
     """A function from grids to the FLIP of their picture: 0 is the same as the converged one, 1 as different as can be.
 
@@ -57,8 +56,8 @@ def studio(
     scene : Scene
     tracer : Tracer
         For the converged picture.
-    radiance : (n, 3) float64
-        Of points of the scene, which the exposure suits.
+    exposure : float
+        The same for all pictures.
     bounces, seed : int
     paths : float
         About how many the converged picture may take.
@@ -76,7 +75,6 @@ def studio(
     height = min(240, height // 12 * 12)
     if height < 48 or importlib.util.find_spec("flip_evaluator") is None:
         return None
-    exposure = tone.automatic_exposure(radiance.astype(np.float32))
     own_seed = shifted_seed(seed, 2**63)
     walls = tuple(
         WallTexture(np.zeros((2, *quad.texels[::-1], 3), np.float32), np.ones((2, *quad.texels[::-1]), np.float32))

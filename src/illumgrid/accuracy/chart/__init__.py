@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from illumgrid import registry
+from illumgrid import registry, tone
 from illumgrid.accuracy.chart.methods import Method, methods, tracers
 from illumgrid.accuracy.chart.race import SEEDS, Flip, Point, Race, front
 from illumgrid.accuracy.cost import measure_pace
@@ -18,7 +18,6 @@ from illumgrid.constants import PATHS
 from illumgrid.errors import BadInput
 from illumgrid.field.lattice import specs_over
 from illumgrid.field.scene import Scene
-from illumgrid.field.volume import Floats
 from illumgrid.samplers.direct import Direct, reachable
 from illumgrid.transport.samples import Queries
 from illumgrid.transport.tracer import Tracer, prepare
@@ -33,8 +32,8 @@ LONGEST = 1e7  # seconds of a budget: four months; counts of paths in proportion
 PARTS_PATHS, PARTS_REFERENCE = (16, 64, 256), 256
 PARTS_POINTS = (512, 4096)
 
-Studio = Callable[[Scene, Tracer, Floats, int, int, float], Flip | None]
-"""From a scene, its tracer, radiance (n, 3) to expose for, bounces, a seed and about how many paths a converged picture
+Studio = Callable[[Scene, Tracer, float, int, int, float], Flip | None]
+"""From a scene, its tracer, an exposure, bounces, a seed and about how many paths a converged picture
 may take: what compares grids with that picture, or None if those are too few."""
 
 
@@ -230,7 +229,8 @@ def _camera(
     if studio is None:
         return None
     albedo = np.array([field.material.albedo for field in scene.fields])[reference.queries.target]
-    return studio(scene, tracer, reference.light * albedo / np.pi, reference.bounces, seed, paths)
+    exposure = tone.automatic_exposure(reference.light, albedo)
+    return studio(scene, tracer, exposure, reference.bounces, seed, paths)
 
 
 def _show_default(race: Race, grid: int | None, paths: int, budget: float) -> list[str]:
