@@ -306,5 +306,12 @@ def _labels(field: Field) -> Iterator[Finding]:
 
 def diagnose(field: Field, spec: GridSpec) -> list[Finding]:
     """All that warns of a field under its range and the grid that is meant for it."""
-    found = [*_labels(field), *_plateau(field), *_noise(field, spec), *_thin(field, spec), *_border(field), *_empty(field)]
+    found = [
+        *_labels(field),
+        *_plateau(field),
+        *_noise(field, spec),
+        *_thin(field, spec),
+        *_border(field),
+        *_empty(field),
+    ]
     return [*found, *_anisotropy(field), *_range(field)]
