@@ -55,7 +55,7 @@ def channels_for(count: int) -> Channels:
     return GREY if count == 1 else RGB
 
 
-def kept(light: ArrayLike, channels: Channels | None = None) -> dict[str, Any]:
+def stored(light: ArrayLike, channels: Channels | None = None) -> dict[str, Any]:
     """Attributes of a holder of light (..., C): `light`, its `channels` (by default by their count), `values` in RGB.
 
     Raises
@@ -70,7 +70,7 @@ def kept(light: ArrayLike, channels: Channels | None = None) -> dict[str, Any]:
     count = array.shape[-1]
     if len(channels) != count:
         raise BadInput(f"light of {count} channels came; expected {len(channels)}: {', '.join(channels.names)}")
-    stored = np.ascontiguousarray(array).view()
-    values = channels.rgb(stored).view()
-    stored.flags.writeable = values.flags.writeable = False
-    return {"light": stored, "channels": channels, "values": values}
+    kept = np.ascontiguousarray(array).view()
+    values = channels.rgb(kept).view()
+    kept.flags.writeable = values.flags.writeable = False
+    return {"light": kept, "channels": channels, "values": values}

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from illumgrid.errors import BadInput
 from illumgrid.field.lattice import GridSpec
 from illumgrid.field.volume import Floats, corners, world_to_index
-from illumgrid.grid.channels import GREY, Channels, kept
+from illumgrid.grid.channels import GREY, Channels, stored
 from illumgrid.grid.lookup import read_lattice
 
 _BLOCK = 1 << 18  # nodes
@@ -65,7 +65,7 @@ class IlluminationGrid:
         for name, array in arrays.items():
             if array.shape != shape:
                 raise BadInput(f"the {name} of a grid has shape {array.shape}; expected {shape}")
-        for name, value in (arrays | kept(self.values, self.channels)).items():
+        for name, value in (arrays | stored(self.values, self.channels)).items():
             object.__setattr__(self, name, value)
 
     def lookup(self, points: ArrayLike) -> NDArray[np.float32]:

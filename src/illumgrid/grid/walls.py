@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from illumgrid.grid.channels import Channels, kept
+from illumgrid.grid.channels import Channels, stored
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +29,7 @@ class WallTexture:
     light: NDArray[np.float32] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        for name, value in kept(self.values, self.channels).items():
+        for name, value in stored(self.values, self.channels).items():
             object.__setattr__(self, name, value)
 
     def lookup(self, u: ArrayLike, v: ArrayLike, t: ArrayLike) -> NDArray[np.float32]:
