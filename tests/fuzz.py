@@ -10,24 +10,30 @@ import os
 import random
 import resource
 import signal
+import struct
 import sys
 import tempfile
 import time
 import warnings
+import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import pydicom
+import pydicom.data
 import SimpleITK as sitk  # noqa: N813
 
+from dicom_files import HOUNSFIELD, enhanced
+from grid_files import cube_file, dx_file
 from illumgrid.errors import BadInput
 from illumgrid.io import store
 from illumgrid.io.readers import read_scene, read_volume
 from illumgrid.light import Illumination
 from test_store import example
 from test_store_trust import reseal
-from volume_files import values, write, write_series
+from volume_files import values, vtk_head, write, write_series
 
 CORPUS = Path(__file__).with_name("corpus")
 SECONDS = 10
@@ -63,6 +69,47 @@ def _volume(ending: str) -> Target:
         return file
 
     return Target(ending, make, lambda file: read_volume(file.parent if file.suffix == ".dcm" else file))
+
+
+def _packed(name: str) -> Target:
+    """Slices packed by one of the codecs of pydicom's own test data."""
+
+    def make(folder: Path) -> Path:
+        whole = pydicom.dcmread(Path(pydicom.data.__file__).parent / "test_files" / name)
+        (folder / "series").mkdir()
+        for k in range(2):
+            whole.ImagePositionPatient, whole.ImageOrientationPatient = [0, 0, k], [1, 0, 0, 0, 1, 0]
+            whole.SOPInstanceUID, whole.SeriesInstanceUID = f"1.2.{k}", "1.2.3"
+            whole.save_as(folder / "series" / f"{k}.dcm")
+        return folder / "series" / "0.dcm"
+
+    return Target(f"packed {name}", make, lambda file: read_volume(file.parent))
+
+
+def _vti(packed: bool) -> Target:
+    def make(folder: Path) -> Path:
+        raw = values("float32").tobytes(order="F")
+        body = struct.pack("<I", len(raw)) + raw
+        if packed:
+            parts = [zlib.compress(raw[k : k + 400]) for k in range(0, len(raw), 400)]
+            sizes = [len(parts), 400, len(raw) % 400, *map(len, parts)]
+            body = struct.pack(f"<{len(sizes)}I", *sizes) + b"".join(parts)
+        head = '<VTKFile type="ImageData" version="1.0" byte_order="LittleEndian" header_type="UInt32"'
+        head += ' compressor="vtkZLibDataCompressor"' * packed
+        head += '><ImageData WholeExtent="0 4 0 5 0 6" Origin="0 0 0" Spacing="1 1 1"><Piece Extent="0 4 0 5 0 6">'
+        head += '<PointData Scalars="f"><DataArray type="Float32" Name="f" format="appended" offset="0"/></PointData>'
+        head += '</Piece></ImageData><AppendedData encoding="raw">_'
+        (folder / "a.vti").write_bytes(head.encode() + body + b"</AppendedData></VTKFile>")
+        return folder / "a.vti"
+
+    return Target("vti packed" if packed else "vti", make, read_volume)
+
+
+def _legacy(folder: Path) -> Path:
+    text = b" ".join(b"%d" % n for n in range(210))
+    field = b"\nFIELD a 2\nb 1 210 float\n" + text + b"\nc 3 70 int\n" + text
+    (folder / "a.vtk").write_bytes(vtk_head("ASCII") + text + field)
+    return folder / "a.vtk"
 
 
 SCENE = """[[field]]
@@ -111,6 +158,14 @@ def _run(part: str, sealed: bool) -> Target:
 
 TARGETS = (
     *map(_volume, ("nrrd", "nii", "nii.gz", "mha", "mrc", "vtk", "gipl", "tif", "dcm", "npy", "npz", "npy.gz")),
+    Target("frames", lambda folder: enhanced(folder / "a.dcm", [3, 0, 2, 1], [HOUNSFIELD] * 4), read_volume),
+    *map(
+        _packed, ("MR_small_RLE.dcm", "MR_small_jpeg_ls_lossless.dcm", "MR_small_jp2klossless.dcm", "JPGExtended.dcm")
+    ),
+    *(_vti(packed) for packed in (False, True)),
+    Target("vtk text", _legacy, read_volume),
+    Target("cube", lambda folder: cube_file(folder / "a.cube"), read_volume),
+    Target("dx", lambda folder: dx_file(folder / "a.dx"), read_volume),
     Target("scene", _scene, read_scene),
     *(_run(part, sealed) for part in (store.RUN, store.EXR) for sealed in (False, True)),
 )

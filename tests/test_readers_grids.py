@@ -5,12 +5,11 @@ import pytest
 import pyvista as pv
 from vtkmodules.vtkIOLegacy import vtkStructuredPointsWriter
 
+from grid_files import NOISE, START, STEP, cube_file, dx_file
 from illumgrid.errors import IllumgridWarning
 from illumgrid.field.volume import index_to_world
 from illumgrid.io.readers import read_volume
 from volume_files import refused, refused_lightly, values, vtk_head, zipped
-
-START, STEP = (10.0, -20.0, 30.0), (1.5, 2.0, 3.0)
 
 
 def grid(points=None, cells=None, active=None):
@@ -36,7 +35,6 @@ def legacy(path, image, text):
     return path
 
 
-NOISE = np.random.default_rng(5).normal(size=(5, 6, 7))
 CELLS = np.random.default_rng(6).normal(size=(4, 5, 6))
 
 
@@ -136,20 +134,6 @@ def test_a_legacy_header_that_lies(tmp_path):
         refused_lightly(tmp_path / "a.vtk")
 
 
-def cube_file(path, fields=NOISE[..., None], atoms=1, sign=1, steps=None, orbitals=None, last=""):
-    """As https://gaussian.com/cubegen/ describes it: the third axis runs fastest."""
-    n, steps = fields.shape[:3], np.diag(STEP) if steps is None else steps
-    lines = ["title", "what it is", f"{atoms} " + " ".join(map(str, START)) + last]
-    lines += [f"{sign * n[k]} " + " ".join(map(str, steps[k])) for k in range(3)]
-    lines += ["6 6.0 1.0 2.0 3.0"] * abs(atoms)
-    if orbitals:
-        lines.append(" ".join(map(str, [len(orbitals), *orbitals])))
-    for row in fields.reshape(n[0] * n[1], -1):
-        lines += [" ".join(f"{v:13.5E}" for v in row[k : k + 6]) for k in range(0, len(row), 6)]
-    path.write_text("\n".join(lines) + "\n")
-    return path
-
-
 def test_cube(tmp_path):
     for path in (cube_file(tmp_path / "a.cube"), zipped(tmp_path / "a.cube"), cube_file(tmp_path / "B.CUB", sign=-1)):
         volume = read_volume(path)
@@ -189,23 +173,6 @@ def test_a_cut_text(tmp_path, name):
             refused_lightly(path)
     path.write_bytes(whole.replace(b"E", b"x"))
     refused(path, "expected")
-
-
-def dx_file(
-    path, binary="", tail='attribute "dep" string "positions"\nobject "regular positions regular connections"\n'
-):
-    """As APBS writes it: the third axis runs fastest."""
-    head = "# Comments\n#\nobject 1 class gridpositions counts 5 6 7\norigin " + " ".join(map(str, START)) + "\n"
-    head += "".join(f"delta {' '.join(map(str, row))}\n" for row in np.diag(STEP))
-    head += "object 2 class gridconnections counts 5 6 7\n"
-    head += f"object 3 class array type double rank 0 items 210 {binary}data follows\n"
-    if binary:
-        path.write_bytes(head.encode() + NOISE.astype("<f8").tobytes() + b"\n" + tail.encode())
-    else:
-        flat = NOISE.ravel()
-        text = "\n".join(" ".join(f"{v:.6E}" for v in flat[k : k + 3]) for k in range(0, 210, 3))
-        path.write_text(f"{head}{text}\n{tail}")
-    return path
 
 
 @pytest.mark.parametrize("binary", ["", "lsb ieee "])

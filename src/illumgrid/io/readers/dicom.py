@@ -14,7 +14,7 @@ import pydicom
 
 from illumgrid.errors import BadInput
 from illumgrid.io.readers.dicom_frames import Frame, frames_of, text
-from illumgrid.io.readers.dicom_pixels import dataset, decoded, on_lattice, planes_of, quiet, scaled
+from illumgrid.io.readers.dicom_pixels import dataset, decoded, on_lattice, planes_of, quiet, scaled, understood
 from illumgrid.io.readers.dicom_stack import arranged, phases, placed, stacks
 from illumgrid.io.readers.limits import AS_FLOAT, check_axes, check_memory
 from illumgrid.io.readers.source import AGAIN, Source, find_source
@@ -90,15 +90,16 @@ def _is_dicom(source: Source) -> bool:
 def _frames(source: Source, names: dict[str, str] | None = None) -> list[Frame]:
     """Frames of a file; none if it holds no image, or one whose copy is among `names`."""
     header = dataset(source, header_only=True)
-    meta = getattr(header, "file_meta", None)
-    stored = pydicom.uid.UID(text(meta or {}, "MediaStorageSOPClassUID") or text(header, "SOPClassUID"))
-    if stored == pydicom.uid.MediaStorageDirectoryStorage:
-        raise BadInput("the index of a medium (DICOMDIR), no image; expected slices; give the folder that holds it")
-    with quiet():
+    with quiet(), understood("its DICOM header"):
+        meta = getattr(header, "file_meta", None)
+        stored = pydicom.uid.UID(text(meta or {}, "MediaStorageSOPClassUID") or text(header, "SOPClassUID"))
+        if stored == pydicom.uid.MediaStorageDirectoryStorage:
+            raise BadInput("the index of a medium (DICOMDIR), no image; expected slices; give the folder it lies in")
         found = frames_of(header, source.file, source.most)
+        uid = text(header, "SOPInstanceUID")
     if not found and (not stored or any(word in stored.name for word in IMAGES)):
         raise BadInput(f"its DICOM header ends too early; {AGAIN}")
-    if found and names is not None and (uid := text(header, "SOPInstanceUID")):
+    if found and names is not None and uid:
         if uid in names:
             names["copies"] = source.file.name
             return []

@@ -48,20 +48,25 @@ def _bytes(source: Source) -> Iterator[Any]:
         yield mapped
 
 
+@contextmanager
+def understood(part: str) -> Iterator[None]:
+    """Turn whatever pydicom raises on damaged bytes, at once or when a value is looked at, into a sentence."""
+    try:
+        yield
+    except (BadInput, MemoryError):
+        raise
+    except Exception as problem:
+        said = "".join(c if c.isprintable() else " " for c in str(problem))
+        what = " ".join(said.split())[:120].replace(". ", ", ").rstrip(".") or type(problem).__name__
+        raise BadInput(f"{part} cannot be read ({what}); {AGAIN}") from None
+
+
 def dataset(source: Source, header_only: bool) -> Any:
     """Read the data set of a file, with or without its pixels."""
-    with quiet(), _bytes(source) as stream:
+    with quiet(), _bytes(source) as stream, understood("its DICOM header"):
         _check_deflated(stream, source)
-        try:
-            # force: files without preamble; what is none was turned away by its first bytes
-            return pydicom.dcmread(stream, stop_before_pixels=header_only, force=True)
-        except BadInput:
-            raise
-        except MemoryError:
-            raise
-        except Exception as problem:
-            what = " ".join(str(problem).split())[:120] or type(problem).__name__
-            raise BadInput(f"its DICOM header cannot be read ({what}); {AGAIN}") from None
+        # force: files without preamble; what is none was turned away by its first bytes
+        return pydicom.dcmread(stream, stop_before_pixels=header_only, force=True)
 
 
 def _check_deflated(stream: Any, source: Source) -> None:
@@ -123,6 +128,27 @@ def decoded(
     """The frames `indices` of a file, unpacked."""
     name = source.file.name
     data = dataset(source, header_only=False)
+    with quiet() as collected, understood(f"the pixels of {name}"):
+        _complete(data)
+        if not any(word in data for word in ("PixelData", "FloatPixelData", "DoubleFloatPixelData")):
+            raise BadInput(f"{name} ends before its pixels; {AGAIN}")
+        _check_packed(data, name)
+        if kind.bits == 1:  # frames need not begin at a whole byte, which iter_pixels asks for
+            bits = pixel_array(data).reshape(-1, kind.rows, kind.columns)
+            yield from ((index, bits[index]) for index in indices)
+            return
+        # The decoder of runs in Rust that pydicom would take, where it is there, panics on damaged data.
+        plugin = "pydicom" if data.file_meta.TransferSyntaxUID == pydicom.uid.RLELossless else ""
+        for index, plane in zip(indices, iter_pixels(data, indices=indices, decoding_plugin=plugin)):
+            yield index, _real(plane, data)
+    said = {" ".join(str(one.message).split()) for one in collected if "pixel data" in str(one.message).lower()}
+    odd = [sentence for sentence in said if "excess padding" not in sentence]  # zeros at the end are usual
+    if odd and len(notes) < 4:
+        notes.append(("dicom", f"{name}: {odd[0][:200]}"))
+
+
+def _complete(data: Any) -> None:
+    """Say how a file without a group of its own is written."""
     meta = getattr(data, "file_meta", None)
     if meta is None or not meta.get("TransferSyntaxUID"):
         data.file_meta = meta = meta if meta is not None else pydicom.dataset.FileMetaDataset()
@@ -130,41 +156,22 @@ def decoded(
         uids = pydicom.uid
         explicit = uids.ExplicitVRLittleEndian if little else uids.ExplicitVRBigEndian
         meta.TransferSyntaxUID = uids.ImplicitVRLittleEndian if implicit else explicit
-    if not any(word in data for word in ("PixelData", "FloatPixelData", "DoubleFloatPixelData")):
-        raise BadInput(f"{name} ends before its pixels; {AGAIN}")
-    _check_packed(data, name)
-    with quiet() as collected:
-        try:
-            if kind.bits == 1:  # frames need not begin at a whole byte, which iter_pixels asks for
-                bits = pixel_array(data).reshape(-1, kind.rows, kind.columns)
-                yield from ((index, bits[index]) for index in indices)
-                return
-            for index, plane in zip(indices, iter_pixels(data, indices=indices)):
-                yield index, _real(plane, data)
-        except (BadInput, MemoryError):
-            raise
-        except Exception as problem:
-            what = " ".join(str(problem).replace("\n", " ").split())[:160].replace(". ", ", ").rstrip(".")
-            raise BadInput(f"the pixels of {name} cannot be read ({what}); {AGAIN}") from None
-    said = {" ".join(str(one.message).split()) for one in collected if "pixel data" in str(one.message).lower()}
-    odd = [sentence for sentence in said if "excess padding" not in sentence]  # zeros at the end are usual
-    if odd and len(notes) < 4:
-        notes.append(("dicom", f"{name}: {odd[0][:200]}"))
 
 
 def _check_packed(data: Any, name: str) -> None:
     """Say which package unpacks a compressed file, if none is there; refuse a plain one that is too short."""
     syntax = data.file_meta.TransferSyntaxUID
+    shown = "".join(c for c in str(syntax.name) if c.isprintable())[:80]
     try:
         decoder = get_decoder(syntax)
     except NotImplementedError:
         raise BadInput(
-            f"its pixels are packed as {syntax.name}, which pydicom does not read; expected JPEG, JPEG-LS, JPEG 2000, "
+            f"its pixels are packed as {shown}, which pydicom does not read; expected JPEG, JPEG-LS, JPEG 2000, "
             "RLE or plain pixels; unpack it elsewhere (gdcmconv --raw)"
         ) from None
     if not decoder.is_available:
         raise BadInput(
-            f"its pixels are packed as {syntax.name}, which needs packages that are not installed; expected them "
+            f"its pixels are packed as {shown}, which needs packages that are not installed; expected them "
             f"beside illumgrid: pip install {CODECS}"
         )
     if not syntax.is_encapsulated and "PixelData" in data:
