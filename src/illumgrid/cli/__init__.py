@@ -1,4 +1,4 @@
-"""The command line: one file a command; nothing else of the package prints."""
+"""The command line: one file per command; only here does the package print."""
 
 import sys
 from collections.abc import Callable
@@ -70,13 +70,11 @@ def guarded(command: Callable[[], Any]) -> int:
     except BadInput as error:
         say(f"illumgrid: {in_options(str(error))}")
     except MemoryError:
-        say("illumgrid: the memory of this machine is too small for this; choose a coarser --grid or a smaller volume")
+        say("illumgrid: out of memory; choose a coarser --grid or a smaller volume")
     except OSError as error:
         say(f"illumgrid: {error.strerror or error}{f': {error.filename}' if error.filename else ''}")
     except Exception as error:
-        if not hasattr(
-            error, "show"
-        ):  # a usage error: of click's, or of typer's own copy of click, as its release has it
+        if not hasattr(error, "show"):  # no usage error, neither of click nor of typer's own copy of it
             raise
         error.show()
     return 2

@@ -12,22 +12,26 @@ from illumgrid.errors import BadInput
 def export(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="A finished run.")],
     file: Annotated[
-        Path, typer.Argument(metavar="FILE", help="What to write: .vti .nrrd .exr .npz (grid), .glb .ply (isosurface).")
+        Path, typer.Argument(metavar="FILE", help="File to write: .vti .nrrd .exr .npz (grid), .glb .ply (isosurface).")
     ],
-    field: Annotated[str | None, typer.Option(metavar="NAME", help="Which field's light. [default: the first]")] = None,
+    field: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Field whose light is written. [default: the first]")
+    ] = None,
     isovalue: Annotated[
         float | None,
-        typer.Option(metavar="C", help="Which isosurface (.glb, .ply). [default: the middle of the range]"),
+        typer.Option(metavar="C", help="Isovalue of the surface (.glb, .ply). [default: the middle of the range]"),
     ] = None,
     on: Annotated[
         str | None,
-        typer.Option(metavar="grid|field", help="On the grid's nodes or the field's voxels. [default: grid]"),
+        typer.Option(
+            metavar="grid|field", help="Sample at the nodes of the grid or at the voxels of the field. [default: grid]"
+        ),
     ] = None,
     array: Annotated[
         str | None,
         typer.Option(
             metavar="NAME",
-            help="Which array a .nrrd holds: irradiance, error, support, field, color. [default: irradiance]",
+            help="Array in a .nrrd: irradiance, error, support, field, color. [default: irradiance]",
         ),
     ] = None,
 ) -> None:
@@ -42,5 +46,5 @@ def export(
     with reported_warnings():
         light = load(folder)
         with progress_bars() as progress:
-            told = exports.write(light, file, field, isovalue, on=on, array=array, progress=progress)
-    say(f"wrote {file}: {told}")
+            written = exports.write(light, file, field, isovalue, on=on, array=array, progress=progress)
+    say(f"wrote {file}: {written}")

@@ -1,4 +1,4 @@
-"""``illumgrid info``: what is inside a volume or a finished run."""
+"""``illumgrid info``: the content of a volume or a finished run."""
 
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -31,7 +31,9 @@ def info(
     ],
     limits: Annotated[
         tuple[float, float] | None,
-        typer.Option("--range", metavar="LO HI", help="Isovalues that a sweep is meant for. [default: as suggested]"),
+        typer.Option(
+            "--range", metavar="LO HI", help="Isovalues to sweep, for the warnings. [default: the suggested range]"
+        ),
     ] = None,
     inside: Annotated[
         str | None, typer.Option(help="Which side of the isovalue is solid: above, below. [default: above]")
@@ -45,7 +47,7 @@ def info(
     downsample: Downsample = None,
     ignore: Ignore = None,
 ) -> None:
-    """Tell what is inside a volume or a finished run, and what of a volume will make trouble."""
+    """Describe a volume or a finished run; for a volume, suggest a range and warn of what will limit the result."""
     from illumgrid.errors import BadInput
     from illumgrid.io import store
 
@@ -56,17 +58,17 @@ def info(
     )
     with reported_warnings(ignore):
         if not store.is_run(source):
-            _told_volume(source, limits, "below" if inside == "below" else "above", reading)
+            _describe_volume(source, limits, "below" if inside == "below" else "above", reading)
         elif extra := given(range=limits, inside=inside, **reading):
             options = ", ".join(f"--{option}" for option in extra)
             raise BadInput(
                 f"{options} came with the finished run {source}; expected a volume file with them; leave them out"
             )
         else:
-            _told_run(source)
+            _describe_run(source)
 
 
-def _told_volume(source: str, limits: tuple[float, float] | None, inside: "Side", reading: dict[str, Any]) -> None:
+def _describe_volume(source: str, limits: tuple[float, float] | None, inside: "Side", reading: dict[str, Any]) -> None:
     from illumgrid.errors import BadInput, tell
     from illumgrid.field.diagnosis import critical_isovalues, diagnose, plateaus
     from illumgrid.field.labels import around_zero
@@ -79,7 +81,7 @@ def _told_volume(source: str, limits: tuple[float, float] | None, inside: "Side"
     if len(labels) > 1:
         raise BadInput(f"--label holds {len(labels)} labels; expected one for info; ask for one after another")
     volume = finite(read_volume(source, **reading, label=labels[0] if labels else None), inside)
-    _told_lattice(volume_name(source), volume)
+    _describe_lattice(volume_name(source), volume)
     low, high, why = suggest_range(volume, inside)
     if labels:
         (low, high), why = around_zero(volume), "a voxel outside to a voxel inside the surface of the label"
@@ -100,7 +102,7 @@ def three(numbers: Any) -> str:
     return ", ".join(f"{x + 0.0:.6g}" for x in numbers)  # no -0
 
 
-def _told_wall(quad: "Quad", texture: "WallTexture") -> None:
+def _describe_wall(quad: "Quad", texture: "WallTexture") -> None:
     rows, nv, nu = texture.values.shape[:3]
     typer.echo(f"{quad.name} (wall)")
     typer.echo(f"  corner           {three(quad.corner)}")
@@ -110,7 +112,7 @@ def _told_wall(quad: "Quad", texture: "WallTexture") -> None:
     typer.echo(f"  light            {nu} x {nv} texels, {rows} isovalues")
 
 
-def _told_lattice(name: str, volume: "Volume") -> None:
+def _describe_lattice(name: str, volume: "Volume") -> None:
     low, high = float(volume.values.min()), float(volume.values.max())
     typer.echo(f"{name}")
     typer.echo(f"  shape            {' x '.join(map(str, volume.shape))} voxels (x, y, z)")
@@ -121,19 +123,19 @@ def _told_lattice(name: str, volume: "Volume") -> None:
     typer.echo(f"  histogram        |{histogram_line(volume)}| (logarithmic)")
 
 
-def _told_run(source: str) -> None:
+def _describe_run(source: str) -> None:
     from illumgrid.chain import load
 
     light = load(source)
     for field, grid in zip(light.scene.fields, light.grids):
-        _told_lattice(field.name, field.volume)
+        _describe_lattice(field.name, field.volume)
         typer.echo(f"  range            {field.range[0]:.6g} to {field.range[1]:.6g}, inside {field.inside}")
         supported = float((grid.support > 0).mean())
         typer.echo(
             f"  light            {' x '.join(map(str, grid.spec.shape))} nodes, {supported:.1%} with light of their own"
         )
     for quad, texture in zip(light.scene.quads, light.walls):
-        _told_wall(quad, texture)
+        _describe_wall(quad, texture)
     recipe = light.recipe
     names = ", ".join(
         f"{kind} {recipe[kind]['name']}" for kind in ("sampler", "backend", "interpolator") if kind in recipe

@@ -1,4 +1,4 @@
-"""``illumgrid plugins``: every stage, with its options and where it comes from."""
+"""``illumgrid plugins``: every stage, with its options and origin."""
 
 import inspect
 from collections.abc import Iterator
@@ -13,10 +13,10 @@ if TYPE_CHECKING:
 
 
 def plugins() -> None:
-    """List every sampler, backend and interpolator: options, package of origin, whether it can run here.
+    """List every sampler, backend and interpolator: options, package, and whether it can run here.
 
-    An option is set by --set STAGE.OPTION=VALUE, such as --set sampler.count=40. ILLUMGRID_DISABLE_PLUGINS=1 switches
-    the plugins of other packages off, ILLUMGRID_DISABLE_PLUGINS=NAME,NAME those of these packages.
+    Set an option by --set STAGE.OPTION=VALUE, such as --set sampler.count=40. ILLUMGRID_DISABLE_PLUGINS=1 disables all
+    plugins of other packages, ILLUMGRID_DISABLE_PLUGINS=NAME,NAME those of these packages.
     """
     from illumgrid import registry
 

@@ -8,17 +8,23 @@ import typer
 def verify(
     backends: Annotated[
         list[str] | None,
-        typer.Option("--backend", metavar="NAME", help="Backend, repeatable. [default: all there are]"),
+        typer.Option("--backend", metavar="NAME", help="Backend to check (repeatable). [default: all]"),
     ] = None,
     paths: Annotated[
-        int, typer.Option(min=1, metavar="N", help="Light paths a scene, shared by its queries; reference takes fewer.")
+        int,
+        typer.Option(min=1, metavar="N", help="Light paths per scene, divided among its queries; fewer for reference."),
     ] = 1 << 18,
-    seed: Annotated[int, typer.Option(min=0, max=2**64 - 1, metavar="N", help="Equal seeds give equal paths.")] = 0,
+    seed: Annotated[
+        int,
+        typer.Option(
+            min=0, max=2**64 - 1, metavar="N", help="Seed of the random numbers; equal seeds give equal paths."
+        ),
+    ] = 0,
 ) -> None:
-    """Judge the backends by scenes whose light has a closed form; exit 1 if one disagrees.
+    """Compare the backends with scenes whose light has a closed form; exit 1 if one disagrees.
 
-    z is the mean difference over the queries in units of its standard error and of a derived bound on what the cells of
-    the surface do; max |z| is that of a single query.
+    z is the mean difference over the queries, divided by its standard error and a derived bound on the error of the
+    discretised surface; max |z| is the largest of a single query.
     """
     from illumgrid.accuracy.verify import HEADER, check, line
 

@@ -97,7 +97,7 @@ class Block:
         return software.traced(seen, camera, width, height)
 
     def sheets(self) -> list[Colored]:
-        """The faces as triangles between the nodes, with the middle planes where the octant is cut out."""
+        """The faces as triangles between the nodes, with those of the middle where the octant is cut out."""
         low, high = self.octant
         found = []
         for axis in range(3):
