@@ -51,8 +51,8 @@ def interpolator(change=lambda samples, grid: grid, before=lambda samples: sampl
     class Changed:
         name: ClassVar[str] = "changed"
 
-        def fill(self, samples, spec, field):
-            return change(samples, Nearest().fill(before(samples), spec, field))
+        def fill(self, samples, nodes):
+            return change(samples, Nearest().fill(before(samples), nodes))
 
     return Changed()
 
@@ -193,6 +193,11 @@ INTERPOLATORS = {
     ],
     "test_an_error_that_nobody_knows_stays_unknown": [
         interpolator(lambda samples, grid: replace(grid, error=np.where(grid.support > 0, 0.1, np.inf))),
+    ],
+    "test_grey_light_is_that_of_three_equal_channels": [
+        interpolator(
+            before=lambda samples: samples if len(samples.channels) > 1 else replace(samples, mean=samples.mean / 2)
+        ),
     ],
     "test_holes_are_passed_over": [interpolator(before=all_good)],
     "test_nothing_is_claimed_beyond_reach": [interpolator(everywhere), interpolator(black_holes)],

@@ -336,6 +336,16 @@ class InterpolatorTests(_StageTests):
         assert far.any() and not grid.support[far].any(), "a node far from every sample claims support"
         assert np.allclose(grid.values, 2.0, rtol=1e-5), "a hole does not hold the light of its neighbours"
 
+    def test_grey_light_is_that_of_three_equal_channels(self) -> None:
+        """Samples of one channel give the values, errors and support of RGB samples."""
+        samples, spec = _answers(np.random.default_rng(6).random(len(_answers(1.0)[0])))
+        grey = Samples(samples.queries, samples.mean[:, :1], samples.m2[:, :1], samples.paths)
+        nodes = Nodes(spec, _scene().fields[0])
+        one, three = (fill_nodes(self.make(), asked, nodes) for asked in (grey, samples))
+        for name in ("values", "error", "support"):
+            same = np.allclose(getattr(one, name), getattr(three, name), rtol=1e-6)
+            assert same, f"samples of one channel give other {name} than samples of three equal channels"
+
     def test_the_order_of_samples_does_not_matter(self) -> None:
         """But for rounding."""
         light = np.random.default_rng(6).random(len(_answers(1.0)[0]))
