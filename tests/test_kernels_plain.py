@@ -9,7 +9,7 @@ import naive
 from illumgrid.backends import kernels
 from illumgrid.backends.numba_ import Numba
 from illumgrid.backends.reference import Reference
-from illumgrid.field.levelset import marchable, upward
+from illumgrid.field.levelset import marchable, turned_levels
 from illumgrid.field.scene import Scene
 from illumgrid.field.volume import Volume, interpolate, outward_normals
 from transport import ALBEDO, colored, everywhere, furnace, linear, noise, on_sets, on_voxels, rotation, waves, worth
@@ -144,8 +144,8 @@ def test_normals_and_solids_are_those_of_the_volume(inside):
     rng = np.random.default_rng(4)
     index = np.concatenate([rng.uniform(0, 1, (80, 3)) * [3, 4, 2], np.argwhere(np.ones((4, 5, 3)))[::2]])
     expected = outward_normals(volume, index, inside)
-    level = np.float64(4.5) * upward(scene)[0]
-    solid = upward(scene)[0] * (interpolate(volume, index) - 4.5) >= 0
+    level = turned_levels(scene, np.array([4.5]))[0]
+    solid = scene.fields[0].upward * (interpolate(volume, index) - 4.5) >= 0
     for u, normal, within in zip(index, expected, solid):
         np.testing.assert_allclose(kernels.gradient_normal(fields, 0, *u), normal, atol=1e-6)
         assert kernels.in_solid(fields, 0, level, tuple(u * volume.spacing), tuple(normal)) == within
@@ -178,7 +178,7 @@ def test_directions_have_the_moments_of_a_cosine():
 def cast(scene, levels, origin, direction):
     n = len(origin)
     t, field, what, normal = np.empty(n), np.empty(n, np.int64), np.empty(n, np.int64), np.zeros((n, 3))
-    levels = np.array(levels, float) * upward(scene)
+    levels = turned_levels(scene, np.array(levels, float))
     origin, direction = np.array(origin, float), np.array(direction, float)
     kernels.cast_rays(marchable(scene), levels, origin, direction, -1, t, field, what, normal)
     return t, field, what, normal
@@ -241,7 +241,7 @@ def test_where_a_ray_touches_a_saddle_there_is_no_normal():
 
 def test_a_path_that_starts_inside_another_solid_is_worth_nothing():
     scene = colored(furnace(linear((1, 0, 0)), linear((1, 0, 0), origin=(0.1, 0.1, 0.1))))
-    levels = np.array([2.5, 2.5]) * upward(scene)  # the second, below, holds all from 0.1 to 2.6 along x
+    levels = turned_levels(scene, np.array([2.5, 2.5]))  # the second, below, holds all from 0.1 to 2.6 along x
     point, normal = (2.5, 3.0, 2.0), (-1.0, 0.0, 0.0)
     for path in range(5):
         key = np.uint64(7)

@@ -5,7 +5,7 @@ import pytest
 from numba import typeof
 
 from illumgrid.field.bricks import lay_bricks
-from illumgrid.field.levelset import isosurface, marchable, off_the_data, turned, upward
+from illumgrid.field.levelset import isosurface, marchable, off_the_data, turned, turned_levels
 from illumgrid.field.scene import Field, Material, Scene
 from illumgrid.field.volume import Volume, world_to_index
 from illumgrid.transport.samples import Queries, in_frame
@@ -184,7 +184,7 @@ def test_two_fields_lie_one_after_the_other_in_the_frame_of_the_first():
         assert np.array_equal(layout.albedo[f], fields[f].material.albedo)
         assert np.array_equal(layout.emission[f], fields[f].material.emission)
     assert layout.background.tolist() == [0.4, 0.5, 0.6]
-    assert upward(scene).tolist() == [1, -1]
+    assert turned_levels(scene, np.array([[2.0, 3.0]])).tolist() == [[2, -3]]
     assert np.shares_memory(marchable(sky(one)).values, one.values)
 
 

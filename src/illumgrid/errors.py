@@ -1,6 +1,8 @@
 """What went wrong, said in one sentence: what came, what was expected, what to do."""
 
+import math
 import warnings
+from collections.abc import Iterable
 
 
 class BadInput(ValueError):
@@ -37,6 +39,24 @@ WARNINGS = {
     "holes": "nodes within the range that got no light of their own",
 }
 """Names of all warnings, and what each is about."""
+
+
+def shown(number: float, among: Iterable[float] = (), digits: int = 4) -> str:
+    """A number as text, with as many digits as it takes to tell it from those `among` which it stands.
+
+    101325 among 101320 and 101330 takes seven: a hundredth of what they span.
+    """
+    all_of = [float(x) for x in (number, *among) if math.isfinite(x)]
+    largest, span = max(map(abs, all_of), default=0.0), max(all_of, default=0.0) - min(all_of, default=0.0)
+    if 0 < span < math.inf and largest / span > 1:
+        digits = max(digits, min(17, math.ceil(math.log10(largest / span)) + 2))
+    return f"{number:.{digits}g}"
+
+
+def shown_range(ends: Iterable[float], digits: int = 4) -> str:
+    """Two numbers as text, "LOW to HIGH", told apart."""
+    low, high = ends
+    return f"{shown(low, (high,), digits)} to {shown(high, (low,), digits)}"
 
 
 def tell(name: str, sentence: str, stacklevel: int = 1) -> None:

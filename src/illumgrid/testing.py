@@ -34,7 +34,11 @@ def _rgb(*light: float) -> Floats:
 
 def _scene() -> Scene:
     """Two balls that overlap, one solid above its isovalue and one below, over a floor and under a lamp and a sky."""
-    place = {"origin": np.array([50.0, -30.0, 20.0]), "spacing": np.array([1.0, 0.7, 1.3]), "direction": _MIRRORED}
+    place: dict[str, Any] = {
+        "origin": np.array([50.0, -30.0, 20.0]),
+        "spacing": np.array([1.0, 0.7, 1.3]),
+        "direction": _MIRRORED,
+    }
     index = np.indices((12, 14, 10))
     local = (index - np.array([5.5, 6.5, 4.5])[:, None, None, None]) * place["spacing"][:, None, None, None]
     apart = [np.sqrt(((local - np.array([x, 0.2, -0.1])[:, None, None, None]) ** 2).sum(axis=0)) for x in (-1.5, 2.0)]

@@ -74,7 +74,7 @@ def _cells_by_step(field: Field) -> tuple[NDArray[np.int64], Floats]:
     """
     from scipy.ndimage import maximum_filter, minimum_filter
 
-    lowest, highest = map(float, field.range)
+    lowest, highest = map(float, field.stored_range)
     share = field.volume.values - lowest  # of this size there is one array, single like the field
     share *= _STEPS / (highest - lowest)
     np.clip(np.floor(share, out=share), -1, _STEPS, out=share)

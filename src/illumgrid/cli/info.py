@@ -69,7 +69,7 @@ def info(
 
 
 def _describe_volume(source: str, limits: tuple[float, float] | None, inside: "Side", reading: dict[str, Any]) -> None:
-    from illumgrid.errors import BadInput, tell
+    from illumgrid.errors import BadInput, shown, shown_range, tell
     from illumgrid.field.diagnosis import critical_isovalues, diagnose, plateaus
     from illumgrid.field.labels import around_zero
     from illumgrid.field.lattice import nodes_over
@@ -85,14 +85,16 @@ def _describe_volume(source: str, limits: tuple[float, float] | None, inside: "S
     low, high, why = suggest_range(volume, inside)
     if labels:
         (low, high), why = around_zero(volume), "a voxel outside to a voxel inside the surface of the label"
-    typer.echo(f"  suggested range  {low:.4g} to {high:.4g}: {why}")
+    typer.echo(f"  suggested range  {shown_range((low, high))}: {why}")
     field = Field(volume_name(source), volume, range=(low, high) if limits is None else limits, inside=inside)  # type: ignore[arg-type]
     if flat := plateaus(volume):
         flat.sort(key=lambda one: -one[1])
-        values = ", ".join(f"{value:.6g} ({share:.1%} of the cells)" for value, share, _ in flat[:6])
+        values = ", ".join(
+            f"{shown(value, volume.extremes, 6)} ({share:.1%} of the cells)" for value, share, _ in flat[:6]
+        )
         typer.echo(f"  plateaus         {values}{f', and {len(flat) - 6} more' if len(flat) > 6 else ''}")
     for at, what in critical_isovalues(field):
-        typer.echo(f"  critical         {at:.4g}: {what}")
+        typer.echo(f"  critical         {shown(at, field.range)}: {what}")
     for finding in diagnose(field, nodes_over(volume)):
         tell(finding.name, finding.sentence)
 
@@ -113,23 +115,25 @@ def _describe_wall(quad: "Quad", texture: "WallTexture") -> None:
 
 
 def _describe_lattice(name: str, volume: "Volume") -> None:
-    low, high = float(volume.values.min()), float(volume.values.max())
+    from illumgrid.errors import shown_range
+
     typer.echo(f"{name}")
     typer.echo(f"  shape            {' x '.join(map(str, volume.shape))} voxels (x, y, z)")
-    typer.echo(f"  spacing          {three(volume.spacing)}")
+    typer.echo(f"  spacing          {three(volume.spacing)}{f' {volume.unit}' if volume.unit else ''}")
     typer.echo(f"  origin           {three(volume.origin)} (world; for medical formats LPS millimetres)")
     typer.echo(f"  axes             {'; '.join(three(volume.direction[:, axis]) for axis in range(3))}")
-    typer.echo(f"  values           {low:.6g} to {high:.6g}")
+    typer.echo(f"  values           {shown_range(volume.extremes, 6)}")
     typer.echo(f"  histogram        |{histogram_line(volume)}| (logarithmic)")
 
 
 def _describe_run(source: str) -> None:
     from illumgrid.chain import load
+    from illumgrid.errors import shown_range
 
     light = load(source)
     for field, grid in zip(light.scene.fields, light.grids):
         _describe_lattice(field.name, field.volume)
-        typer.echo(f"  range            {field.range[0]:.6g} to {field.range[1]:.6g}, inside {field.inside}")
+        typer.echo(f"  range            {shown_range(field.range, 6)}, inside {field.inside}")
         supported = float((grid.support > 0).mean())
         typer.echo(
             f"  light            {' x '.join(map(str, grid.spec.shape))} nodes, {supported:.1%} with light of their own"

@@ -10,7 +10,7 @@ import typer
 
 from illumgrid.cli.reading import Array, Channel, Crop, Downsample, Label, Spacing, Time, given, labels_of
 from illumgrid.cli.terminal import Ignore, omitted_light, progress_bars, reported_warnings, say
-from illumgrid.errors import BadInput, tell
+from illumgrid.errors import BadInput, shown_range, tell
 
 if TYPE_CHECKING:
     from illumgrid.field.builtin import Preset
@@ -217,7 +217,7 @@ def run(
         scene = asked.make(smooth or 0.0)
         for field in scene.fields:
             shape = " x ".join(map(str, field.volume.shape))
-            say(f"{field.name}: {shape} voxels, isovalues {field.range[0]:.4g} to {field.range[1]:.4g}")
+            say(f"{field.name}: {shape} voxels, isovalues {shown_range(field.range)}")
             for finding in diagnose(field, nodes_over(field.volume, grid)):
                 tell(finding.name, finding.sentence)
         if backend == "auto":

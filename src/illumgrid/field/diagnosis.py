@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from illumgrid.constants import DENSITY
+from illumgrid.errors import shown, shown_range
 from illumgrid.field.labels import labels_in
 from illumgrid.field.lattice import GridSpec
 from illumgrid.field.scene import Field
@@ -70,7 +71,7 @@ def plateaus(volume: Volume) -> list[tuple[float, float, Floats]]:
     large = np.flatnonzero(size >= _PLATEAU)
     first = cells[np.unique(number, return_index=True)[1]]  # by number of the piece, from 1 on
     place = np.stack(np.unravel_index(first[large - 1], flat.shape), axis=1)
-    value = v[tuple(place.T)].astype(float)
+    value = volume.in_units(v[tuple(place.T)].astype(float))
     found = []
     for level in np.unique(value):
         own = value == level
@@ -80,7 +81,7 @@ def plateaus(volume: Volume) -> list[tuple[float, float, Floats]]:
 
 
 def turning(volume: Volume, low: float, high: float) -> float:
-    """How much the normal turns from voxel to voxel on the level sets of a range: root mean square, 2 sin(angle/2).
+    """How much the normal turns from voxel to voxel on level sets of a range of stored values: its RMS, 2 sin(angle/2).
 
     It is what a grid of one node a voxel has to resolve: 0.1 on smooth fields, 0.8 on raw magnetic resonance images,
     1.4 where neighbouring normals have nothing to do with each other. 0 where the range has no voxels.
@@ -151,14 +152,15 @@ def critical_isovalues(field: Field) -> list[tuple[float, str]]:
     comes after it both last for a thirtieth of the range.
     """
     small = _reduced(field.volume, _SIDE)
-    levels = np.linspace(field.range[0], field.range[1], _LEVELS)
+    low, high = field.stored_range
+    levels = np.linspace(low, high, _LEVELS)
     numbers = [topology(field.solid(small.values, level)) for level in levels]
     found = []
     for k in range(1, _LEVELS - 2):
         before, after = numbers[k - 1 : k + 1], numbers[k + 1 : k + 3]
         if before[0] == before[1] != after[0] == after[1] and any(after[0]):
             changes = [f"{what} {a} to {b}" for what, a, b in zip(_COUNTED, before[1], after[0]) if a != b]
-            found.append((float(0.5 * (levels[k] + levels[k + 1])), ", ".join(changes)))
+            found.append((float(field.volume.in_units(0.5 * (levels[k] + levels[k + 1]))), ", ".join(changes)))
     return found
 
 
@@ -172,12 +174,12 @@ def _plateau(field: Field) -> Iterator[Finding]:
     if not found:
         return
     found.sort(key=lambda flat: -flat[1])
-    shown = ", ".join(f"{value:.6g} ({_below(share)} of the cells)" for value, share, _ in found[:4])
+    named = ", ".join(f"{shown(at, field.range, 6)} ({_below(share)} of the cells)" for at, share, _ in found[:4])
     more = f" and {len(found) - 4} more values" if len(found) > 4 else ""
     at = ", ".join(f"{x + 0.0:.4g}" for x in found[0][2])
     yield Finding(
         "plateau",
-        f"the field {field.name!r} is flat at {shown}{more}, first around ({at}): a level set has no normal there and "
+        f"the field {field.name!r} is flat at {named}{more}, first around ({at}): a level set has no normal there and "
         "no light of its own; choose a --range without plateaus, or --smooth 1",
     )
 
@@ -189,10 +191,10 @@ def floor_of(turn: float, density: float = 1.0) -> float:
 
 def _noise(field: Field, spec: GridSpec) -> Iterator[Finding]:
     density = max(spec.shape) / max(field.volume.shape)
-    turn = turning(field.volume, *field.range)
+    turn = turning(field.volume, *field.stored_range)
     if turn < _ROUGH:
         return
-    after = turning(smooth(field.volume, 1.0), *field.range)
+    after = turning(smooth(field.volume, 1.0), *field.stored_range)
     if after < _SOOTHED * turn:
         yield Finding(
             "noise",
@@ -219,7 +221,7 @@ def _crossings(values: NDArray[np.float32], isovalue: float, most: int) -> Float
 
 def _thin(field: Field, spec: GridSpec) -> Iterator[Finding]:
     volume, middle = field.volume, float(np.mean(field.range))
-    index = _crossings(volume.values, middle, 3000)
+    index = _crossings(volume.values, float(volume.to_stored(middle)), 3000)
     if not len(index):
         return
     inward = -outward_normals(volume, index, field.inside)
@@ -231,8 +233,8 @@ def _thin(field: Field, spec: GridSpec) -> Iterator[Finding]:
         todo = f"--grid {enough} has {DENSITY} nodes per voxel" if longest < enough else "resample the volume finer"
         yield Finding(
             "thin",
-            f"{lost:.0%} of the surface of field {field.name!r} at {middle:.4g} is that of parts thinner than two "
-            f"nodes of a grid of {longest}, so that light of both sides mixes there; {todo}",
+            f"{lost:.0%} of the surface of field {field.name!r} at {shown(middle, field.range)} is that of parts "
+            f"thinner than two nodes of a grid of {longest}, so that light of both sides mixes there; {todo}",
         )
 
 
@@ -241,16 +243,16 @@ def _border(field: Field) -> Iterator[Finding]:
     for axis, letter in enumerate("xyz"):
         for end, side in ((0, "first"), (-1, "last")):
             plane = np.take(field.volume.values, end, axis=axis)
-            met = int(np.count_nonzero(field.solid(plane, field.widest)))
+            met = int(np.count_nonzero(field.solid(plane, field.volume.to_stored(field.widest))))
             touched, total = touched + met, total + plane.size
             if met:
                 faces.append(f"the {side} {letter}")
     if touched > _TOUCHED * total:
         yield Finding(
             "border",
-            f"at {field.widest:.4g} the solid of field {field.name!r} meets the volume's border ({', '.join(faces)} "
-            f"plane, {_below(touched / total)} of the border), where it is cut and closed by a plain cap; take a "
-            "larger crop, or a --range farther inside",
+            f"at {shown(field.widest, field.range)} the solid of field {field.name!r} meets the volume's border "
+            f"({', '.join(faces)} plane, {_below(touched / total)} of the border), where it is cut and closed by a "
+            "plain cap; take a larger crop, or a --range farther inside",
         )
 
 
@@ -258,15 +260,15 @@ def _empty(field: Field) -> Iterator[Finding]:
     low, high = field.range
     levels = np.linspace(low, high, _LEVELS)
     values = field.volume.values
-    counts, _ = np.histogram(values, np.concatenate([[-np.inf], levels, [np.inf]]))
+    counts, _ = np.histogram(values, np.concatenate([[-np.inf], field.volume.to_stored(levels), [np.inf]]))
     below = np.cumsum(counts)[:-1]
     smallest = np.minimum(below, values.size - below)
     bare = levels[smallest < _FEW]
     if len(bare):
         yield Finding(
             "empty",
-            f"isovalues from {bare.min():.4g} to {bare.max():.4g} of field {field.name!r} have (nearly) no surface: "
-            f"fewer than {_FEW} voxels lie on one side; choose a --range that leaves them out",
+            f"isovalues from {shown(bare.min(), levels)} to {shown(bare.max(), levels)} of field {field.name!r} have "
+            f"(nearly) no surface: fewer than {_FEW} voxels lie on one side; choose a --range that leaves them out",
         )
 
 
@@ -282,13 +284,13 @@ def _anisotropy(field: Field) -> Iterator[Finding]:
 
 
 def _range(field: Field) -> Iterator[Finding]:
-    lowest, highest = float(field.volume.values.min()), float(field.volume.values.max())
+    ends = (lowest, highest) = field.volume.extremes
     if field.range[0] < lowest or field.range[1] > highest:
         yield Finding(
             "range",
-            f"the range {field.range[0]:.4g} to {field.range[1]:.4g} of field {field.name!r} goes beyond its data, "
-            f"which run from {lowest:.4g} to {highest:.4g}: part of the sweep shows nothing; choose isovalues "
-            "between them",
+            f"the range {shown(field.range[0], ends)} to {shown(field.range[1], ends)} of field {field.name!r} goes "
+            f"beyond its data, which run from {shown_range(ends)}: part of the sweep shows "
+            "nothing; choose isovalues between them",
         )
 
 

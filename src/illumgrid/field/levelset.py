@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def off_the_data(volume: Volume, isovalue: float, inside: Side) -> float:
-    """Nudge an isovalue that is also a data value by an ulp, towards the side that keeps the solid {h >= c} (or <=).
+    """Nudge a stored isovalue that is also a data value by an ulp, towards the side that keeps the solid.
 
     An extraction exactly at data values leaves duplicate faces and holes.
     """
@@ -66,7 +66,7 @@ def extract(volume: Volume, isovalue: float, inside: Side, capped: bool) -> tupl
     """
     from skimage.measure import marching_cubes
 
-    level = off_the_data(volume, isovalue, inside)
+    level = off_the_data(volume, float(volume.to_stored(isovalue)), inside)
     values = volume.values.copy()  # the extraction wants a writeable buffer
     if capped:
         spread = max(float(np.ptp(values)), abs(level), 1e-30)
@@ -176,6 +176,8 @@ def _quads_in_frame(scene: Scene) -> dict[str, NDArray[Any]]:
     }
 
 
-def upward(scene: Scene) -> Floats:
-    """+1 or -1 for each field (F,): what turns h and its isovalues so that the solid is upwards."""
-    return np.array([field.upward for field in scene.fields])
+def turned_levels(scene: Scene, levels: Floats) -> Floats:
+    """Isovalues (..., F) as they are compared with the values of a `Marchable`: as stored, the solid upwards."""
+    sign = np.array([field.upward for field in scene.fields])
+    stored = np.stack([f.volume.to_stored(levels[..., k]) for k, f in enumerate(scene.fields)], axis=-1)
+    return np.asarray(stored * sign, np.float64)

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from illumgrid.errors import BadInput
+from illumgrid.errors import BadInput, shown, shown_range
 from illumgrid.field.volume import UPWARD, Floats, Side, Volume, finite, index_to_world
 
 
@@ -69,7 +69,9 @@ def suggest_range(volume: Volume, inside: Side = "above") -> tuple[float, float,
         volume = finite(volume, inside)
         lowest, highest = np.float64(volume.values.min()), np.float64(volume.values.max())
     if lowest == highest:
-        raise BadInput(f"the values are all {lowest:g}; expected a field that varies, or there is no isosurface")
+        raise BadInput(
+            f"the values are all {volume.in_units(lowest):g}; expected a field that varies, or there is no isosurface"
+        )
     counts, edges = np.histogram(volume.values, 1024, (lowest, highest))
     depth = 0.5 * (edges[1:] + edges[:-1])
     if inside == "below":
@@ -82,10 +84,11 @@ def suggest_range(volume: Volume, inside: Side = "above") -> tuple[float, float,
         depth[max(np.searchsorted(np.cumsum(within), 0.5 * within.sum()), np.searchsorted(depth, threshold) + 1)]
     )
     share = within.sum() / counts.sum()
-    low, high = sorted((sign * threshold, sign * deep))
+    at, half = (float(volume.in_units(sign * x)) for x in (threshold, deep))
+    low, high = sorted((at, half))
     why = (
-        f"Otsu's threshold {sign * threshold:.4g} separates object ({share:.1%} of the voxels) and background, "
-        f"and half of the object lies {inside} {sign * deep:.4g}"
+        f"Otsu's threshold {shown(at, volume.extremes)} separates object ({share:.1%} of the voxels) and background, "
+        f"and half of the object lies {inside} {shown(half, volume.extremes)}"
     )
     return low, high, why
 
@@ -120,16 +123,16 @@ class Field:
         volume = finite(self.volume, self.inside)
         asked = suggest_range(volume, self.inside)[:2] if self.range is None else self.range
         limits = np.array(asked, dtype=float)
-        largest = np.finfo(np.float32).max  # volumes are float32
-        if limits.shape != (2,) or not -largest <= limits[0] < limits[1] <= largest:
+        largest = np.finfo(np.float32).max  # stored values are float32
+        if limits.shape != (2,) or not limits[0] < limits[1] or not (abs(volume.to_stored(limits)) <= largest).all():
             raise BadInput(
                 f"the range of field {self.name!r} is {np.asarray(asked).tolist()}; expected a low and a high isovalue"
             )
-        low, high = float(volume.values.min()), float(volume.values.max())
+        low, high = volume.extremes
         if limits[1] < low or limits[0] > high:
             raise BadInput(
                 f"the range {limits[0]:g} to {limits[1]:g} of field {self.name!r} misses its data, "
-                f"which run from {low:g} to {high:g}; choose isovalues between them"
+                f"which run from {shown_range((low, high), 6)}; choose isovalues between them"
             )
         limits.setflags(write=False)
         object.__setattr__(self, "volume", volume)
@@ -141,12 +144,17 @@ class Field:
         return UPWARD[self.inside]
 
     @property
+    def stored_range(self) -> Floats:
+        """The range (2,) in terms of the volume's stored values, with which it can be compared."""
+        return self.volume.to_stored(self.range)
+
+    @property
     def widest(self) -> float:
         """Isovalue of the range with the largest solid, which contains the solids of all others."""
         return float(self.range[0] if self.upward > 0 else self.range[1])
 
     def solid(self, values: ArrayLike, isovalues: ArrayLike) -> NDArray[np.bool_]:
-        """Whether points with these values of h lie in the solids of these isovalues."""
+        """Whether points with these values of h lie in the solids of these isovalues; or both as stored values."""
         return np.asarray(self.upward * np.asarray(values) >= self.upward * np.asarray(isovalues))
 
     def place(self, isovalues: ArrayLike) -> Floats:

@@ -10,7 +10,7 @@ from typing import Any, Literal, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from illumgrid.errors import BadInput, tell
+from illumgrid.errors import BadInput, shown_range, tell
 
 Floats = NDArray[np.float64]
 Side = Literal["above", "below"]
@@ -78,18 +78,25 @@ def placement(origin: ArrayLike, spacing: ArrayLike, direction: ArrayLike) -> tu
 
 @dataclass(frozen=True, eq=False)
 class Volume:
-    """A scalar field h sampled at voxel centres, compared by identity.
+    """A scalar field h = slope · value + intercept, sampled at voxel centres, compared by identity.
+
+    Values are kept in single precision. Where that would cost h more than `DIGITS` of its span (a large offset), or
+    where h is beyond the numbers of single precision, they are mapped onto about -1 to 1; slope and intercept undo it.
 
     Parameters
     ----------
     values : (nx, ny, nz) array_like of real numbers
-        h at the voxel centres, axes x, y, z; kept as read-only float32. At least two voxels along each axis.
+        At the voxel centres, axes x, y, z; kept as read-only float32. At least two voxels along each axis.
     origin : (3,) array_like
         World position of voxel (0, 0, 0).
     spacing : (3,) array_like
         World distance between neighbouring voxels along each axis.
     direction : (3, 3) array_like
         Columns are the world directions of the axes, orthonormal; a determinant of -1 mirrors.
+    slope, intercept : float
+        What turns values into h, in whose units all isovalues are. After construction the slope is positive.
+    unit : str, optional
+        Of the world coordinates, such as "mm" or "µm".
 
     Raises
     ------
@@ -101,6 +108,9 @@ class Volume:
     origin: Floats = field(default_factory=lambda: np.zeros(3))
     spacing: Floats = field(default_factory=lambda: np.ones(3))
     direction: Floats = field(default_factory=lambda: np.eye(3))
+    slope: float = 1.0
+    intercept: float = 0.0
+    unit: str | None = None
 
     def __post_init__(self) -> None:
         values = np.asarray(self.values)
@@ -108,12 +118,20 @@ class Volume:
             raise BadInput(f"the values have dtype {values.dtype}; expected real numbers")
         if values.ndim != 3 or min(values.shape) < 2:
             raise BadInput(f"the values have shape {values.shape}; expected three axes of at least 2 voxels each")
+        slope, intercept = float(self.slope), float(self.intercept)
+        if not (np.isfinite([slope, intercept]).all() and slope):
+            raise BadInput(f"slope and intercept are {slope} and {intercept}; expected finite numbers, the first not 0")
+        if slope < 0:
+            values, slope = -values.astype(float), -slope
+        values, slope, intercept = _for_single_precision(values, slope, intercept)
         with np.errstate(over="ignore"):  # a float64 beyond float32 becomes infinite, which is handled
             single = np.ascontiguousarray(values, dtype=np.float32).view()
         if not np.isfinite(single).any():
             raise BadInput("the values are all NaN or infinite; expected finite numbers")
         single.setflags(write=False)
         object.__setattr__(self, "values", single)
+        object.__setattr__(self, "slope", slope)
+        object.__setattr__(self, "intercept", intercept)
         for name, value in zip(
             ("origin", "spacing", "direction"), placement(self.origin, self.spacing, self.direction)
         ):
@@ -126,15 +144,59 @@ class Volume:
         nx, ny, nz = self.values.shape
         return nx, ny, nz
 
+    @property
+    def extremes(self) -> tuple[float, float]:
+        """Lowest and highest h, among the finite ones."""
+        low, high = np.float64(self.values.min()), np.float64(self.values.max())
+        if not (np.isfinite(low) and np.isfinite(high)):
+            good = self.values[np.isfinite(self.values)]
+            low, high = np.float64(good.min()), np.float64(good.max())
+        return float(self.in_units(low)), float(self.in_units(high))
+
+    def in_units(self, stored: ArrayLike) -> Floats:
+        """What h is where the stored values are these."""
+        plain = self.slope == 1 and self.intercept == 0
+        return np.asarray(stored) if plain else np.asarray(stored, float) * self.slope + self.intercept
+
+    def to_stored(self, isovalues: ArrayLike) -> Floats:
+        """The stored values, in double precision, where h is these isovalues."""
+        plain = self.slope == 1 and self.intercept == 0
+        return np.asarray(isovalues) if plain else (np.asarray(isovalues, float) - self.intercept) / self.slope
+
     def __repr__(self) -> str:
         return (
-            f"Volume({'x'.join(map(str, self.shape))}, {self.values.min():g} .. {self.values.max():g}, "
+            f"Volume({'x'.join(map(str, self.shape))}, {shown_range(self.extremes, 6)}, "
             f"origin={self.origin.tolist()}, spacing={self.spacing.tolist()}, direction={self.direction.tolist()})"
         )
 
     def with_values(self, values: NDArray[Any]) -> "Volume":
-        """Other values on the same lattice."""
-        return Volume(values, self.origin, self.spacing, self.direction)
+        """Other stored values on the same lattice, with the same map."""
+        return Volume(values, self.origin, self.spacing, self.direction, self.slope, self.intercept, self.unit)
+
+
+DIGITS = 1e-5
+"""Share of the span of a field that rounding to single precision may cost it."""
+
+
+def _for_single_precision(values: NDArray[Any], slope: float, intercept: float) -> tuple[NDArray[Any], float, float]:
+    """The same field with values that single precision holds well: as they came, wherever it does."""
+    if values.dtype.itemsize < 4 or values.dtype == np.float32:
+        return values, slope, intercept
+    wide = values.astype(np.float64) if values.dtype != np.float64 else values
+    good = np.isfinite(wide)
+    if not good.any():
+        return values, slope, intercept
+    low, high = (float(f(wide, where=good, initial=i)) for f, i in ((np.min, np.inf), (np.max, -np.inf)))
+    largest, span = max(abs(low), abs(high)), high / 2 - low / 2  # halves: the whole may overflow
+    fits = largest * float(np.finfo(np.float32).eps) / 4 <= DIGITS * span
+    if span == 0 or (fits and 1e-30 <= largest <= 1e30):
+        return values, slope, intercept
+    with np.errstate(over="ignore"):
+        if np.array_equal(wide[good].astype(np.float32), wide[good]):
+            return values, slope, intercept
+    middle = 0.0 if fits else low + span
+    scale = float(2.0 ** np.clip(np.frexp(span)[1], -1022, 1022))
+    return (wide - middle) / scale, slope * scale, intercept + slope * middle
 
 
 def finite(volume: Volume, inside: Side) -> Volume:
@@ -144,12 +206,14 @@ def finite(volume: Volume, inside: Side) -> Volume:
         return volume
     low, high = volume.values[good].min(), volume.values[good].max()
     outermost = low if UPWARD[inside] > 0 else high
+    lowest, highest = volume.extremes
+    farthest = lowest if UPWARD[inside] > 0 else highest
     bad = int(good.size - good.sum())
     where = np.unravel_index(int(np.argmin(good)), volume.shape)
     tell(
         "finite",
         f"{bad} of {good.size} voxels are not finite (the first at {tuple(map(int, where))}): NaN became "
-        f"{outermost:g}, the value farthest outside, infinities became {low:g} and {high:g}",
+        f"{farthest:g}, the value farthest outside, infinities became {lowest:g} and {highest:g}",
         stacklevel=2,
     )
     return volume.with_values(np.nan_to_num(volume.values, nan=outermost, posinf=high, neginf=low))
@@ -186,14 +250,18 @@ def box_corners(lattice: Lattice) -> Floats:
 
 
 def interpolate(volume: Volume, index: Floats) -> Floats:
-    """Trilinear values (n,) at fractional indices (n, 3), which are clamped to the border."""
+    """Trilinear h (n,) at fractional indices (n, 3), which are clamped to the border."""
+    return volume.in_units(_interpolate_stored(volume, index))
+
+
+def _interpolate_stored(volume: Volume, index: Floats) -> Floats:
     from scipy.ndimage import map_coordinates
 
     return np.asarray(map_coordinates(volume.values, index.T, output=np.float64, order=1, mode="nearest"))
 
 
 def cell_gradient(volume: Volume, index: Floats) -> Floats:
-    """Gradient (n, 3) of the trilinear cell that contains each index (n, 3), per world unit along the volume's axes."""
+    """Gradient (n, 3) of the stored values in the cell of each index (n, 3), per world unit, along the axes."""
     cell, f = cells(volume, index)
     result = np.zeros((len(index), 3))
     for corner in np.ndindex(2, 2, 2):
@@ -206,7 +274,7 @@ def cell_gradient(volume: Volume, index: Floats) -> Floats:
 
 
 def smooth_gradient(volume: Volume, index: Floats) -> Floats:
-    """Central differences (one-sided at the border), interpolated: (n, 3), per world unit, along the volume's axes."""
+    """Central differences of the stored values, interpolated: (n, 3), per world unit, along the volume's axes."""
     top = np.array(volume.shape) - 1
     result = np.zeros((len(index), 3))
     for voxel, weight in corners(volume, index):
@@ -255,10 +323,11 @@ def project(volume: Volume, index: Floats, isovalues: Floats) -> tuple[Floats, N
     top = np.array(volume.shape) - 1.0
     arrived = np.asarray(((index >= -ON_A_VOXEL) & (index <= top + ON_A_VOXEL)).all(axis=1))
     last = np.full(len(at), np.inf)
+    levels = volume.to_stored(isovalues)
     moving = np.flatnonzero(arrived)
     for _ in range(24):
         here = at[moving]
-        miss = isovalues[moving] - interpolate(volume, here)
+        miss = levels[moving] - _interpolate_stored(volume, here)
         slope = cell_gradient(volume, here)
         for axis in range(3):  # this component jumps across a plane of voxels: take the mean of both cells
             on = (here[:, axis] == np.floor(here[:, axis])) & (here[:, axis] > 0) & (here[:, axis] < top[axis])

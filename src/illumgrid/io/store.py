@@ -217,6 +217,7 @@ def _describe(stored: Stored) -> Record:
 
     fields = [
         {"name": f.name, "range": f.range.tolist(), "inside": f.inside}
+        | {"slope": f.volume.slope, "intercept": f.volume.intercept, "unit": f.volume.unit}
         | {"albedo": f.material.albedo.tolist(), "emission": f.material.emission.tolist()}
         | lattice(f.volume)
         for f in stored.scene.fields
@@ -270,7 +271,10 @@ def _rebuild(record: Record, parts: dict[str, dict[str, Image]]) -> Stored:
         values, error, support = (_array(light, names, spec.shape) for names in (channels.names, "error", "support"))
         grids.append(IlluminationGrid(spec, values, error, support, channels))
         values = _array(parts.pop(f"field/{about['name']}"), "Y", _shape(about))
-        volume, material = Volume(values, *(about[k] for k in PLACE)), Material(about["albedo"], about["emission"])
+        origin, spacing, direction = (about[k] for k in PLACE)
+        slope, intercept = about.get("slope", 1.0), about.get("intercept", 0.0)
+        volume = Volume(values, origin, spacing, direction, slope, intercept, about.get("unit"))
+        material = Material(about["albedo"], about["emission"])
         fields.append(Field(about["name"], volume, material, about["range"], about["inside"]))
     quads, walls = [], []
     for about in record["scene"]["quads"]:

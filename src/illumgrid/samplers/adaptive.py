@@ -27,11 +27,11 @@ TOPOLOGY = 0.1
 
 
 def _cells_in_range(field: Field) -> Iterator[tuple[Floats, Floats, Floats]]:
-    """Lowest value, highest value and mean slope (m,) of the cells that the range crosses, in blocks.
+    """Lowest and highest stored value and mean slope (m,) of the cells that the range crosses, in blocks.
 
     The slope is the mean of |∇h| over the 8 Gauss points of the trilinear cell: at the centre alone it may vanish.
     """
-    values = field.volume.values
+    values, (lowest, highest) = field.volume.values, field.stored_range
     rows = max(1, _CELLS // (values.shape[1] * values.shape[2]))
     shares = 0.5 + np.array([-0.5, 0.5]) / 3**0.5
     weight = np.array([(1 - shares), shares])  # (end, Gauss point)
@@ -40,7 +40,7 @@ def _cells_in_range(field: Field) -> Iterator[tuple[Floats, Floats, Floats]]:
         corners = np.stack([block[tuple(slice(c, n - 1 + c) for c, n in zip(at, block.shape))].ravel()
                             for at in product((0, 1), repeat=3)])  # fmt: skip
         low, high = corners.min(axis=0), corners.max(axis=0)
-        crossed = (low < high) & (low < field.range[1]) & (high > field.range[0])
+        crossed = (low < high) & (low < highest) & (high > lowest)
         cube = corners[:, crossed].reshape(2, 2, 2, -1)
         x, y, z = (np.diff(cube, axis=axis).squeeze(axis) / field.volume.spacing[axis] for axis in range(3))
         x, y, z = (np.einsum("abm,ap,bq->pqm", edges, weight, weight) for edges in (x, y, z))
@@ -56,6 +56,7 @@ def distance_between(field: Field, edges: Floats) -> Floats:
     insensitive to the comb in a histogram of integers and to plateaus, whose volume no level set crosses. It is 0 where
     there is no level set.
     """
+    edges = field.volume.to_stored(edges)
     step = np.diff(edges)
     volume, area = np.zeros((2, len(step)))
     for low, high, slope in _cells_in_range(field):
@@ -81,7 +82,8 @@ def critical_values(field: Field) -> tuple[Floats, NDArray[np.int64]]:
     the voxel is critical. Equal values are ordered by their position in the array, so that a plateau counts once.
     """
     values = np.pad(field.upward * field.volume.values, 1, constant_values=-np.inf)
-    within = (field.volume.values >= field.range[0]) & (field.volume.values <= field.range[1])
+    low, high = field.stored_range
+    within = (field.volume.values >= low) & (field.volume.values <= high)
     own = np.flatnonzero(np.pad(within, 1))
     stride = np.array([values.shape[1] * values.shape[2], values.shape[2], 1])
     steps = np.array(list(product((-1, 0, 1), repeat=3)))
@@ -97,7 +99,7 @@ def critical_values(field: Field) -> tuple[Floats, NDArray[np.int64]]:
             corners = around[np.ix_(*([1, 1 + s] if s else [1] for s in step))].reshape(-1, len(voxel))
             change[first : first + _CELLS] += (-1) ** np.count_nonzero(step) * corners.all(axis=0)
     critical = change != 0
-    return flat[own[critical]].astype(float) * field.upward, change[critical]
+    return field.volume.in_units(flat[own[critical]].astype(float) * field.upward), change[critical]
 
 
 def adaptive_rows(scene: Scene, count: int, topology: float = TOPOLOGY) -> Floats:

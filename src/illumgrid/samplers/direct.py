@@ -29,8 +29,8 @@ def _any_corner(voxels: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 def crossed_cells(field: Field) -> NDArray[np.bool_]:
     """Voxel cells (nx - 1, ny - 1, nz - 1) through which some level set of the field's range passes."""
-    values = field.volume.values
-    return _any_corner(values >= field.range[0]) & _any_corner(values <= field.range[1])
+    values, (low, high) = field.volume.values, field.stored_range
+    return _any_corner(values >= low) & _any_corner(values <= high)
 
 
 def reachable(field: Field, spec: GridSpec) -> NDArray[np.int64]:

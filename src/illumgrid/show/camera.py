@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from illumgrid.errors import BadInput
-from illumgrid.field.levelset import turned, upward
+from illumgrid.field.levelset import turned, turned_levels
 from illumgrid.field.scene import Scene, suggest_range
 from illumgrid.field.volume import Floats, box_corners, index_to_world
 
@@ -108,7 +108,8 @@ def up_of(scene: Scene) -> str:
         low, high, _ = suggest_range(first.volume, first.inside)
     except BadInput:  # constant
         return "z"
-    areas = first.solid(first.volume.values, low if first.upward > 0 else high).sum(axis=(0, 1))
+    level = first.volume.to_stored(low if first.upward > 0 else high)
+    areas = first.solid(first.volume.values, level).sum(axis=(0, 1))
     ends = areas[areas > 0][[0, -1]] / areas.max()
     return "-z" if ends[1] > FLAT and ends[0] < ROUND else "z"
 
@@ -151,7 +152,7 @@ def _column_ends(values: NDArray[np.float32], level: float) -> Floats:
 def outline_of(scene: Scene, row: Floats) -> Floats:
     """World points (m, 3) whose hull is that of walls, and of the solids under a row of levels (volumes if none)."""
     found = []
-    for field, level in zip(scene.fields, row * upward(scene)):
+    for field, level in zip(scene.fields, turned_levels(scene, row)):
         values = turned(field.volume, field.inside)
         for axis in range(3):
             ends = _column_ends(np.moveaxis(values, axis, 2), level)

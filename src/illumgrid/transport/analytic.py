@@ -8,6 +8,7 @@ are exact: the gradient normal is x/|x|. The facet's is that of its cell's middl
 """
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -63,7 +64,7 @@ def _case(
     return Case(name, scene, queries, truth, bound + _ROUNDING * truth.max(axis=1), bounces, reason)
 
 
-def _field(name: str, values: Floats, limits: ArrayLike, albedo: ArrayLike, glows: bool, **place: Floats) -> Field:
+def _field(name: str, values: Floats, limits: ArrayLike, albedo: ArrayLike, glows: bool, **place: Any) -> Field:
     color = np.asarray(albedo) * np.ones(3)
     material = Material(color, 1 - color if glows else np.zeros(3))
     return Field(name, Volume(values.astype(np.float32), **place), material, np.asarray(limits, float))

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from illumgrid.errors import BadInput
-from illumgrid.field.levelset import upward
+from illumgrid.field.levelset import turned_levels
 from illumgrid.field.scene import Scene
 from illumgrid.field.volume import Floats, index_to_world, interpolate, outward_normals, project, world_to_index
 from illumgrid.grid.channels import GREY, RGB, Channels, channels_for
@@ -236,4 +236,4 @@ def join_samples(parts: Sequence[Samples]) -> Samples:
 def in_frame(scene: Scene, queries: Queries) -> tuple[Floats, Floats, Floats]:
     """Points (n, 3) and normals (n, 3) of queries in the frame of the scene, and their levels (n, F) turned upward."""
     axes = scene.fields[0].volume.direction
-    return scene.to_frame(queries.point), queries.normal @ axes, queries.level * upward(scene)
+    return scene.to_frame(queries.point), queries.normal @ axes, turned_levels(scene, queries.level)

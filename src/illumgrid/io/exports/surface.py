@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from illumgrid.errors import BadInput
+from illumgrid.errors import BadInput, shown, shown_range
 from illumgrid.field.levelset import isosurface
 from illumgrid.io.exports.arrays import display_linear
 from illumgrid.tone import encode_srgb
@@ -57,25 +57,27 @@ class LitSurface:
 def lit(light: "Illumination", number: int, isovalue: float | None, progress: "Progress") -> LitSurface:
     """Extract an isosurface of field `number`, by default that in the middle of its range, and look its light up."""
     field = light.scene.fields[number]
-    low, high = (float(x) for x in field.range)
+    ends = (low, high) = tuple(float(x) for x in field.range)
     level = 0.5 * (low + high) if isovalue is None else float(isovalue)
     if not low <= level <= high:
         raise BadInput(
-            f"the isovalue is {level:g}, but the light of field {field.name!r} is that of {low:g} to {high:g}; choose "
+            f"the isovalue is {shown(level, ends, 6)}, but the light of field {field.name!r} is that of "
+            f"{shown_range(ends, 6)}; choose "
             "one within, or compute the light of a wider range"
         )
     progress("surface", 0, 2)
     mesh = isosurface(field.volume, level, field.inside)
     if not len(mesh.faces):
+        ends = field.volume.extremes
         raise BadInput(
-            f"field {field.name!r} has no surface at isovalue {level:g}: its values are {field.volume.values.min():g} "
-            f"to {field.volume.values.max():g}; choose an isovalue between"
+            f"field {field.name!r} has no surface at isovalue {level:g}: its values are "
+            f"{shown_range(ends, 6)}; choose an isovalue between"
         )
     progress("surface", 1, 2)
-    shown = display_linear(light, number, light.grids[number].lookup(mesh.vertices))
+    colour = display_linear(light, number, light.grids[number].lookup(mesh.vertices))
     progress("surface", 2, 2)
     progress("file", 0, 1)
-    return LitSurface(field.name, level, light.exposure, mesh, np.clip(shown, 0.0, 1.0))
+    return LitSurface(field.name, level, light.exposure, mesh, np.clip(colour, 0.0, 1.0))
 
 
 def write_glb(path: Path, surface: LitSurface) -> None:

@@ -153,7 +153,7 @@ def place(stored: Stored) -> tuple[Volume, tuple[Note, ...]]:
         values = values * np.float64(stored.slope) + np.float64(stored.intercept)
     else:
         check_memory(values.size * AS_FLOAT)
-    return Volume(values, stored.origin, spacing, exact), notes
+    return Volume(values, stored.origin, spacing, exact, unit=stored.unit), notes
 
 
 _SHEARED = (

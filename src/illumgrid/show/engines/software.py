@@ -6,7 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 from numpy.typing import NDArray
 
-from illumgrid.field.levelset import upward
+from illumgrid.field.levelset import turned_levels
 from illumgrid.field.volume import Floats
 from illumgrid.show.camera import Camera
 from illumgrid.show.shade import Colors, Shown, opaque
@@ -48,7 +48,7 @@ def draw(shown: Shown, camera: Camera, width: int, height: int, background: Colo
         direction, n = directions @ axes, len(directions)
         origin = np.tile(eye, (n, 1))
         t, number, what, normal = np.zeros(n), np.zeros(n, np.int64), np.zeros(n, np.int64), np.zeros((n, 3))
-        cast_rays(fields, shown.row * upward(shown.scene), origin, direction, -1, t, number, what, normal)
+        cast_rays(fields, turned_levels(shown.scene, shown.row), origin, direction, -1, t, number, what, normal)
         facing = -np.einsum("ij,ij->i", normal, direction)
         color = np.tile(background, (n, 1))
         for k in range(len(shown.scene.fields)):

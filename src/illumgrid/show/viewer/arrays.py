@@ -43,7 +43,8 @@ def reduced(volume: Volume, most: int) -> Volume:
     padded = np.pad(volume.values, [(0, -n % factor) for n in volume.shape], mode="edge")
     split = padded.reshape([k for n in padded.shape for k in (n // factor, factor)])
     origin = index_to_world(volume, np.full((1, 3), (factor - 1) / 2))[0]
-    return Volume(split.mean(axis=(1, 3, 5)), origin, volume.spacing * factor, volume.direction)
+    means = split.mean(axis=(1, 3, 5))
+    return Volume(means, origin, volume.spacing * factor, volume.direction, volume.slope, volume.intercept, volume.unit)
 
 
 def thinned(grid: IlluminationGrid, most: int) -> IlluminationGrid:

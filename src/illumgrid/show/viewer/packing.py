@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from illumgrid.errors import shown_range
 from illumgrid.field.levelset import turned
 from illumgrid.field.scene import Field, Scene
 from illumgrid.field.volume import Floats, Lattice, box_corners
@@ -56,19 +57,19 @@ class Stage:
 
 def _histogram(field: Field) -> dict[str, Any]:
     """Voxels over the swept range and a third of its span on either side, as far as there are data."""
-    values, (low, high) = field.volume.values, field.range
+    values, (low, high) = field.volume.values, field.stored_range
     margin = (high - low) / 3
     low = min(low, max(float(values.min()), low - margin))
     high = max(high, min(float(values.max()), high + margin))
     counts, _ = np.histogram(values, _BINS, (low, high))
-    return {"counts": counts.tolist(), "limits": [float(low), float(high)]}
+    return {"counts": counts.tolist(), "limits": field.volume.in_units([float(low), float(high)]).tolist()}
 
 
 def _field(light: Illumination, number: int, stage: Stage, into: Bytes, notes: list[str]) -> dict[str, Any]:
     field, whole = light.scene.fields[number], light.grids[number]
     volume, grid = reduced(field.volume, MOST_VOXELS), thinned(whole, MOST_NODES)
     sign = field.upward
-    ends = sorted(sign * field.range)
+    ends = sorted(sign * field.stored_range)
     steps, base, step, clamped = field_steps(turned(volume, field.inside), (ends[0], ends[1]))
     _note_reduced(notes, f"The field of {field.name}", "voxels", field.volume.shape, volume.shape)
     _note_reduced(notes, f"The light of {field.name}", "nodes", whole.spec.shape, grid.spec.shape)
@@ -86,7 +87,8 @@ def _field(light: Illumination, number: int, stage: Stage, into: Bytes, notes: l
         "albedo": albedo.tolist(),
         "swatch": _css(WHITE * albedo / albedo.max(initial=1e-9)),
         "histogram": _histogram(field),
-        "values": pack_values(steps, into) | {"base": base, "step": step},
+        "values": pack_values(steps, into)
+        | {"base": base * field.volume.slope + sign * field.volume.intercept, "step": step * field.volume.slope},
         "light": pack_light(shown * (light.exposure / np.pi), error, into),
         "toIndex": stage.to_index(volume).T.ravel().tolist(),
         "toTexture": (texture @ stage.to_index(grid.spec)).T.ravel().tolist(),
@@ -166,7 +168,7 @@ def packed(light: Illumination, up: str | None = None) -> tuple[dict[str, Any], 
     stage, notes = Stage.of(scene), list[str]()
     fields = [_field(light, number, stage, into, notes) for number in range(len(scene.fields))]
     walls, atlas = _walls(light, stage, into)
-    ranges = " to ".join(f"{end:g}" for end in scene.fields[0].range)
+    ranges = shown_range(scene.fields[0].range, 6)
     several = "all fields share one sweep" if len(fields) > 1 else f"light for isovalues {ranges}"
     described = {
         "title": ", ".join(f.name for f in scene.fields),
