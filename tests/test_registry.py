@@ -55,7 +55,7 @@ def fresh(monkeypatch):
     """No plugins except those that a test installs."""
     others = {d.dist.name for d in registry.entry_points(group="illumgrid")}
     monkeypatch.setenv(registry.SWITCH, ",".join(sorted(others)))
-    registry._told_of.clear()
+    registry._reported.clear()
     registry._registry.cache_clear()
     yield
     registry._registry.cache_clear()
@@ -242,7 +242,7 @@ def test_plugins_are_switched_off_all_or_by_name(install, monkeypatch):
     install("good", STAGE)
     assert len(told()) == 1
     monkeypatch.setenv(registry.SWITCH, f"{registry.os.environ[registry.SWITCH]}, my-own-plugin")
-    registry._told_of.clear()
+    registry._reported.clear()
     assert told() == [] and ig.sampler("mine")
     monkeypatch.setenv(registry.SWITCH, "1")
     assert {e.package for e in registry.entries()} == {"illumgrid"}
@@ -272,7 +272,7 @@ def test_a_run_beside_a_broken_plugin_tells_of_it_and_ends_well(install, call, t
     quick = ("run", "v.npy", "--range", "0.3", "0.9", "--grid", "5", "--paths", "1", "--bounces", "0", "--no-preview")
     assert "the plugin rotten 1.0 (rotten) cannot be used in full" in call(*quick, "-o", "out")
     assert "mould" in str(ig.load(tmp_path / "out").recipe["warnings"][0])
-    registry._told_of.clear()
+    registry._reported.clear()
     assert "rotten" in call("plugins")
 
 

@@ -1,7 +1,7 @@
-"""What every stage promises, as tests: a plugin's suite is a subclass of one of these with the attribute ``stage``.
+"""Requirements of stages, as tests: a plugin's suite is a subclass of one of these with the attribute ``stage``.
 
-``stage`` is a stage, or what makes one when it is called: the class itself, for a stage with its defaults. pytest finds
-the tests of a class whose name begins with Test. Each failure is a sentence that says which promise is broken.
+``stage`` is a stage, or a callable that makes one, such as the class itself for a stage with its defaults. pytest
+collects classes whose name begins with Test. Each failure message states the violated requirement.
 """
 
 import json
@@ -41,16 +41,16 @@ def _scene() -> Scene:
     }
     index = np.indices((12, 14, 10))
     local = (index - np.array([5.5, 6.5, 4.5])[:, None, None, None]) * place["spacing"][:, None, None, None]
-    apart = [np.sqrt(((local - np.array([x, 0.2, -0.1])[:, None, None, None]) ** 2).sum(axis=0)) for x in (-1.5, 2.0)]
+    radius = [np.sqrt(((local - np.array([x, 0.2, -0.1])[:, None, None, None]) ** 2).sum(axis=0)) for x in (-1.5, 2.0)]
     above = Field(
         "above",
-        Volume((8.0 - apart[0]).astype(np.float32), **place),
+        Volume((8.0 - radius[0]).astype(np.float32), **place),
         Material(_rgb(0.8, 0.6, 0.4)),
         np.array([4.5, 5.5]),
     )
     below = Field(
         "below",
-        Volume(apart[1].astype(np.float32), **place),
+        Volume(radius[1].astype(np.float32), **place),
         Material(_rgb(0.5, 0.5, 0.5)),
         np.array([1.8, 2.8]),
         "below",
@@ -62,7 +62,7 @@ def _scene() -> Scene:
 
 
 def _questions(scene: Scene, points: int) -> Queries:
-    """Queries on both fields' level sets in the middle of the sweep, those inside the other solid among them."""
+    """Queries on both fields' level sets in the middle of the sweep, including those inside the other solid."""
     return join_queries(list(on_level_sets(scene, scene.levels([0.5]), 0, points=points)))
 
 
@@ -71,17 +71,17 @@ def _same(one: Any, other: Any, names: Sequence[str]) -> bool:
 
 
 class _StageTests:
-    """What holds for any stage."""
+    """Requirements of any stage."""
 
     stage: ClassVar[Any]
 
     @classmethod
     def make(cls) -> Any:
-        """The stage that is tested."""
+        """The stage under test."""
         return cls.stage() if callable(cls.stage) else cls.stage
 
     def test_options_are_the_fields_of_a_frozen_dataclass(self) -> None:
-        """Equal options make equal stages, which cannot be changed, and say what they are."""
+        """Equal options give equal, immutable stages with a complete repr."""
         stage = self.make()
         frozen = is_dataclass(stage) and cast(Any, stage).__dataclass_params__.frozen
         assert frozen, f"{type(stage).__name__} is not a frozen dataclass"
@@ -95,7 +95,7 @@ class _StageTests:
 
 
 class SamplerTests(_StageTests):
-    """What a sampler promises. ``stage``: a sampler, or its class."""
+    """Requirements of a sampler. ``stage``: a sampler, or its class."""
 
     def asked(self, seed: int = 0) -> list[Queries]:
         """All batches for the scene of these tests."""
@@ -104,7 +104,7 @@ class SamplerTests(_StageTests):
         return list(self.make().queries(scene, specs, seed))
 
     def test_batches_have_shapes_and_types(self) -> None:
-        """Every array is as `illumgrid.Queries` says."""
+        """Every array matches `illumgrid.Queries`."""
         batches = self.asked()
         assert sum(map(len, batches)), "no question was asked"
         for batch in batches:
@@ -127,7 +127,7 @@ class SamplerTests(_StageTests):
         assert len(np.unique(ids)) == len(ids), "two queries have the same id"
 
     def test_points_lie_on_their_level_sets(self) -> None:
-        """The field has the value of the query's own row there."""
+        """At each point, the field has the isovalue of the query's own row."""
         scene, queries = _scene(), join_queries(self.asked())
         for number, field in enumerate(scene.fields):
             own = queries[(queries.target == number) & queries.normal.any(axis=1)]
@@ -136,7 +136,7 @@ class SamplerTests(_StageTests):
             assert worst < 1e-6, f"a point is off its level set by {worst:.1e} of the range"
 
     def test_normals_are_unit_and_outward(self) -> None:
-        """Gradient normals, towards the outside of the solid; (0, 0, 0) marks a hole."""
+        """Gradient normals, pointing out of the solid; (0, 0, 0) marks a hole."""
         scene, queries = _scene(), join_queries(self.asked())
         for number, field in enumerate(scene.fields):
             own = queries[(queries.target == number) & queries.normal.any(axis=1)]
@@ -149,12 +149,12 @@ class SamplerTests(_StageTests):
             assert worst > 1 - 1e-6, f"the cosine between a normal and the outward gradient is {worst:.3f}"
 
     def test_equal_seeds_give_equal_queries(self) -> None:
-        """Nothing random has a state that outlives a call."""
+        """No random state outlives a call."""
         one, again = join_queries(self.asked(7)), join_queries(self.asked(7))
         assert _same(one, again, _PARTS), "the same seed gave other queries"
 
     def test_the_smallest_volume_is_sampled(self) -> None:
-        """2 x 2 x 2 voxels, and a range that few level sets reach."""
+        """2 x 2 x 2 voxels, and a range with few level sets."""
         scene = Scene.sky(Volume(np.arange(8, dtype=np.float32).reshape(2, 2, 2)), range=(6.5, 9.0))
         specs = [GridSpec.over(scene.fields[0].volume, 2)]
         for batch in self.make().queries(scene, specs, 0):
@@ -162,17 +162,17 @@ class SamplerTests(_StageTests):
 
 
 class BackendTests(_StageTests):
-    """What a backend promises. ``stage``: a backend, or its class.
+    """Requirements of a backend. ``stage``: a backend, or its class.
 
-    Closed forms of light are asked of every backend but one that says ``transport = False``. ``paths`` is how many
-    paths a check may take, fewer for a slow backend; ``cases`` are the closed forms.
+    Every backend is tested against closed forms of light unless it sets ``transport = False``. ``paths`` is the
+    approximate number of paths per check, fewer for a slow backend; ``cases`` are the closed forms.
     """
 
     paths: ClassVar[int] = 1 << 14
     cases: ClassVar[Sequence[Any]] = CASES
 
     def solve(self, queries: Queries, count: int | range = 8, seed: int = 3) -> Samples:
-        """Answers in the scene of these tests."""
+        """Samples in the scene of these tests."""
         paths = range(count) if isinstance(count, int) else count
         answer: Samples = self.make().solve(_scene(), queries, paths=paths, bounces=1, seed=seed)
         return answer
@@ -182,7 +182,7 @@ class BackendTests(_StageTests):
         return _questions(_scene(), int(np.clip(self.paths // 512, 6, 30)))
 
     def test_answers_have_shapes_and_types(self) -> None:
-        """Every query is answered in its order, and left as it was."""
+        """Every query gets a sample, in order, and is left unchanged."""
         scene = _scene()
         walls = [on_quad(scene, number, 5.0, np.array([[0.5, 0.5], [0.4, 0.6]])) for number in range(2)]
         asked = join_queries([self.questions(), *walls])
@@ -204,7 +204,7 @@ class BackendTests(_StageTests):
         assert _same(self.solve(asked), self.solve(asked), ("mean", "m2", "paths")), "the same seed gave other answers"
 
     def test_answers_do_not_depend_on_the_batch(self) -> None:
-        """A query alone is answered as in company, bit for bit."""
+        """The sample of a query is the same alone and in a batch, bit for bit."""
         asked = self.questions()
         whole = self.solve(asked)
         for rows in (np.arange(len(asked))[::-3], np.array([5])):
@@ -212,7 +212,7 @@ class BackendTests(_StageTests):
             assert _same(part, whole[rows], ("mean", "m2", "paths")), "an answer depends on the batch it came in"
 
     def test_ranges_of_paths_combine(self) -> None:
-        """Work can be continued: the mean of two ranges is that of the whole."""
+        """Work can be continued: the mean of two ranges equals that of the whole."""
         asked = self.questions()
         both = combine(self.solve(asked, range(8)), self.solve(asked, range(8, 24)))
         off = np.abs(both.mean - self.solve(asked, 24).mean).max()
@@ -234,7 +234,7 @@ class BackendTests(_StageTests):
         assert marked, "a query without a normal, or inside another field's solid, got an answer"
 
     def test_no_query_and_no_path_are_no_trouble(self) -> None:
-        """Nothing asked, nothing answered; without paths every answer is a hole; one path has no error of its own."""
+        """No queries give no samples; without paths every sample is a hole; one path has no error of its own."""
         asked = _questions(_scene(), 5)
         assert len(self.solve(asked[:0])) == 0, "no query got an answer"
         none = self.solve(asked, 0)
@@ -242,10 +242,10 @@ class BackendTests(_StageTests):
         assert np.isinf(self.solve(asked, 1).stderr).all(), "the error of a single path is not infinite"
 
     def test_error_bars_are_honest(self) -> None:
-        """At 95 % they cover at least 90 % of the truths; their median is at most 1.5 times the true RMS error.
+        """Bars of 95 % cover at least 90 % of the references; their median is at most 1.5 times the true RMS error.
 
-        The truth is the backend's own, from 8 times the paths of another seed; its error is added. How far a right
-        backend may miss by chance, once in a thousand, is added too.
+        The reference is the backend's own, from 8 times the paths with another seed; its error is added. The bounds
+        allow for chance deviations of a correct backend, exceeded once in a thousand.
         """
         asked = _questions(_scene(), int(np.clip(self.paths // 128, 16, 128)))  # on each of two fields
         few, truth = self.solve(asked, 32), self.solve(asked, 256, seed=4)
@@ -258,7 +258,7 @@ class BackendTests(_StageTests):
         assert ratio <= most, f"the median bar is {ratio:.2f} times the true error; expected at most {most:.2f}"
 
     def test_light_is_as_its_closed_forms_say(self) -> None:
-        """Scenes whose light is known, for surfaces that are level sets or their meshes: see `transport.analytic`."""
+        """Scenes with known light, on level sets or their meshes: see `transport.analytic`."""
         stage = self.make()
         if not capabilities(stage).transport:
             raise unittest.SkipTest("the backend says that it is no light transport")
@@ -269,10 +269,10 @@ class BackendTests(_StageTests):
 
 
 class InterpolatorTests(_StageTests):
-    """What an interpolator promises. ``stage``: an interpolator, or its class."""
+    """Requirements of an interpolator. ``stage``: an interpolator, or its class."""
 
     def fill(self, light: Any = 1.0, m2: Any = 1.0, paths: Any = 4, rows: Any = slice(None), **density: int) -> Any:
-        """Grid, samples and spec: answers on level sets of field 0, whose light may be a function of the points."""
+        """Grid filled from samples on level sets of field 0, whose light may be a function of the points."""
         samples, spec = _answers(light, m2, paths, **density)
         grid = fill_nodes(self.make(), samples[rows], Nodes(spec, _scene().fields[0]))
         self.check(grid, spec)
@@ -280,7 +280,7 @@ class InterpolatorTests(_StageTests):
 
     @staticmethod
     def check(grid: IlluminationGrid, spec: GridSpec) -> None:
-        """What holds for any grid."""
+        """Requirements of any grid."""
         assert grid.spec == spec or _same(grid.spec, spec, ("shape", "origin", "spacing", "direction")), "another grid"
         assert np.isfinite(grid.values).all(), "a value is not finite"
         assert (grid.support >= 0).all() and np.isfinite(grid.support).all(), "a support is negative or not finite"
@@ -288,7 +288,7 @@ class InterpolatorTests(_StageTests):
         assert np.isinf(grid.error[grid.support == 0]).all(), "a node without support has a finite error"
 
     def test_a_constant_is_reproduced(self) -> None:
-        """Whatever the weights are, they add up to 1; and holes hold the value of their neighbours."""
+        """Weights add up to 1, and holes have the value of their neighbours."""
         light = np.array([0.25, 1.0, 3.0])
         grid = self.fill(light)
         assert (grid.support > 0).any(), "no node is supported"
@@ -296,7 +296,7 @@ class InterpolatorTests(_StageTests):
         assert off < 1e-5, f"a constant is off by {off:.1e}"
 
     def test_more_samples_come_nearer(self) -> None:
-        """Light that is linear in space: its error shrinks where samples are three times as close."""
+        """The error of light that is linear in space shrinks if samples are three times as dense."""
         slope = np.array([0.3, -0.2, 0.4])
         errors = []
         for density in ({"levels": 4, "points": 40}, {"levels": 12, "points": 360}):
@@ -308,21 +308,21 @@ class InterpolatorTests(_StageTests):
         assert errors[1] < 0.7 * errors[0], f"with more samples the error went from {errors[0]:.3g} to {errors[1]:.3g}"
 
     def test_errors_are_carried(self) -> None:
-        """Noise of a known size: the errors of nodes are about as large as what it does to them."""
+        """The errors of nodes agree with the effect of noise of a known size."""
         random, sigma = np.random.default_rng(5), 0.1
         noisy = self.fill(lambda x: 1 + sigma * random.standard_normal(len(x)), 12 * sigma**2)
         good = noisy.support > 0
         true = float(np.sqrt(((noisy.values[good, :1] - 1) ** 2).mean()))
-        told = float(np.sqrt((noisy.error[good].astype(float) ** 2).mean()))
-        assert 0.7 * true <= told <= 1.5 * true, f"the errors say {told:.3g}; noise moved the nodes by {true:.3g}"
+        stated = float(np.sqrt((noisy.error[good].astype(float) ** 2).mean()))
+        assert 0.7 * true <= stated <= 1.5 * true, f"the errors say {stated:.3g}; noise moved the nodes by {true:.3g}"
 
     def test_an_error_that_nobody_knows_stays_unknown(self) -> None:
-        """Answers of one path have no error of their own: neither has a node that rests on them."""
+        """Samples of one path have no error of their own, and neither have nodes that depend on them."""
         grid = self.fill(1.0, 0.0, 1)
         assert (grid.support > 0).any() and np.isinf(grid.error).all(), "single paths gave a finite error"
 
     def test_holes_are_passed_over(self) -> None:
-        """An answer without paths is as good as none."""
+        """Samples without paths are ignored."""
         count = len(_answers(1.0)[0])
         hole = np.arange(count) % 3 == 0
         light = np.where(hole, 0.0, 1.0 + np.arange(count) % 2)
@@ -331,12 +331,12 @@ class InterpolatorTests(_StageTests):
         assert _same(marked, without, ("values", "error", "support")), "an answer without paths was used"
 
     def test_nothing_is_claimed_beyond_reach(self) -> None:
-        """More than four cells' diagonals from every sample a node is a hole, which holds the light of a neighbour."""
+        """A node more than four cell diagonals from every sample is a hole, which has the light of a neighbour."""
         samples, spec = _answers(1.0)
         corner = np.linalg.norm(samples.queries.point - samples.queries.point[0], axis=1) < 0.5
         grid = self.fill(2.0, rows=corner)
-        apart = np.linalg.norm(spec.nodes() - samples.queries.point[0], axis=1)
-        far = (apart > 0.5 + 4.5 * np.linalg.norm(spec.spacing)).reshape(spec.shape)
+        distance = np.linalg.norm(spec.nodes() - samples.queries.point[0], axis=1)
+        far = (distance > 0.5 + 4.5 * np.linalg.norm(spec.spacing)).reshape(spec.shape)
         assert far.any() and not grid.support[far].any(), "a node far from every sample claims support"
         assert np.allclose(grid.values, 2.0, rtol=1e-5), "a hole does not hold the light of its neighbours"
 
@@ -351,13 +351,13 @@ class InterpolatorTests(_StageTests):
             assert same, f"samples of one channel give other {name} than samples of three equal channels"
 
     def test_the_order_of_samples_does_not_matter(self) -> None:
-        """But for rounding."""
+        """Up to rounding."""
         light = np.random.default_rng(6).random(len(_answers(1.0)[0]))
         one, other = self.fill(light), self.fill(light, rows=slice(None, None, -1))
         assert np.allclose(one.values, other.values, atol=1e-4), "the order of the samples changes the light"
 
     def test_samples_at_one_place_are_no_trouble(self) -> None:
-        """Their light lies between."""
+        """Their light lies between that of the samples."""
         samples, spec = _answers(np.arange(len(_answers(1.0)[0])) % 2 + 1.0)
         point = np.repeat(samples.queries.point[:4], len(samples) // 4 + 1, axis=0)[: len(samples)]
         moved = replace(samples, queries=replace(samples.queries, point=point))
@@ -367,7 +367,7 @@ class InterpolatorTests(_StageTests):
         assert len(values) and values.min() > 1 - 1e-3 and values.max() < 2 + 1e-3, "coincident samples overshoot"
 
     def test_no_sample_at_all_is_a_grid_of_holes(self) -> None:
-        """Values 0, support 0, errors infinite, and no NaN; so too where every answer is a hole."""
+        """Values 0, support 0, errors infinite, and no NaN; the same if every sample is a hole."""
         for grid in (self.fill(rows=slice(0)), self.fill(0.0, 0.0, 0)):
             empty = not grid.values.any() and not grid.support.any() and np.isinf(grid.error).all()
             assert empty, "a grid without samples claims light"
@@ -381,7 +381,7 @@ def _between(spec: GridSpec) -> Any:
 
 
 def _answers(light: Any, m2: Any = 1.0, paths: Any = 4, levels: int = 8, points: int = 160) -> tuple[Samples, GridSpec]:
-    """Answers on level sets of field 0 of the scene, which is lit as asked for."""
+    """Samples of the given light on level sets of field 0 of the scene."""
     scene = _scene()
     spec = GridSpec.over(scene.fields[0].volume, 14)
     rows = scene.levels(np.linspace(0, 1, levels))

@@ -1,4 +1,4 @@
-"""Built-in scenes, made by code: no data needed."""
+"""Built-in synthetic scenes, which need no data."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -9,12 +9,12 @@ from illumgrid.field.scene import Field, Material, Scene, box_around
 from illumgrid.field.volume import Floats, Volume
 
 _VOXELS = 64
-_RADIUS = 0.62  # of the sphere on which the nucleons of one kind are strewn; the volume spans -1 to 1
+_RADIUS = 0.62  # of the sphere that carries the nucleons of one kind; the volume spans -1 to 1
 _SPREAD = 0.16  # standard deviation of the kernel
 
 
 def spread(points: Floats, voxels: int = _VOXELS, sigma: float = _SPREAD) -> Volume:
-    """Density of point masses (n, 3) spread by a Gaussian kernel, on -1 to 1, scaled to a maximum of 1."""
+    """Density of point masses (n, 3) smoothed by a Gaussian kernel, on [-1, 1]³, scaled to a maximum of 1."""
     axis = np.linspace(-1.0, 1.0, voxels)
     # A Gaussian is a product over the axes.
     along = [np.exp(-((axis[:, None] - points[:, a]) ** 2) / (2 * sigma**2)) for a in range(3)]
@@ -24,7 +24,7 @@ def spread(points: Floats, voxels: int = _VOXELS, sigma: float = _SPREAD) -> Vol
 
 
 def nucleons(count: int, turn: float) -> Floats:
-    """Point masses (count, 3) spread evenly over a sphere (a Fibonacci lattice), and one at its centre."""
+    """Point masses (count, 3) distributed uniformly over a sphere (a Fibonacci lattice), and one at its centre."""
     k = np.arange(count - 1) + 0.5
     height, angle = 1 - 2 * k / (count - 1), np.pi * (1 + 5**0.5) * k + turn
     ring = np.sqrt(1 - height**2)
@@ -47,7 +47,7 @@ def nucleus() -> Scene:
 
 @dataclass(frozen=True)
 class Preset:
-    """A built-in scene with options that make it quick."""
+    """A built-in scene with options chosen for speed."""
 
     make: Callable[[], Scene]
     grid: int

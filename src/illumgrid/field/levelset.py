@@ -1,4 +1,4 @@
-"""A level set, as a mesh and as something to march through."""
+"""Level sets, as meshes and as bricks for marching."""
 
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -15,9 +15,9 @@ if TYPE_CHECKING:
 
 
 def off_the_data(volume: Volume, isovalue: float, inside: Side) -> float:
-    """Nudge a stored isovalue that is also a data value by an ulp, towards the side that keeps the solid.
+    """Shift a stored isovalue that is also a data value by one ulp, to the side that keeps the solid.
 
-    An extraction exactly at data values leaves duplicate faces and holes.
+    Extraction exactly at data values would create duplicate faces and holes.
     """
     level = np.float32(isovalue)
     if not (volume.values == level).any():
@@ -33,14 +33,14 @@ def isosurface(volume: Volume, isovalue: float, inside: Side = "above", capped: 
     volume : Volume
     isovalue : float
     inside : {"above", "below"}
-        Which side is solid; the faces look away from it.
+        Which side is solid; the faces point away from it.
     capped : bool
         Close the solid where it meets the border of the volume: the mesh is then watertight.
 
     Returns
     -------
     trimesh.Trimesh
-        World units, normals towards the outside; empty when no voxel edge crosses the isovalue.
+        World units, normals pointing outside; empty if no voxel edge crosses the isovalue.
 
     References
     ----------
@@ -62,21 +62,21 @@ def isosurface(volume: Volume, isovalue: float, inside: Side = "above", capped: 
 def extract(volume: Volume, isovalue: float, inside: Side, capped: bool) -> tuple[Floats, NDArray[np.int64]]:
     """Vertices (k, 3) in index coordinates and faces (m, 3) of a level set: see `isosurface`.
 
-    Faces are counterclockwise from outside in a right-handed picture of the index axes.
+    Faces are counterclockwise as seen from outside, with right-handed index axes.
     """
     from skimage.measure import marching_cubes
 
     level = off_the_data(volume, float(volume.to_stored(isovalue)), inside)
-    values = volume.values.copy()  # the extraction wants a writeable buffer
+    values = volume.values.copy()  # the extraction needs a writeable buffer
     if capped:
         spread = max(float(np.ptp(values)), abs(level), 1e-30)
         beyond = min(values.min(), level) - spread if inside == "above" else max(values.max(), level) + spread
         values = np.pad(values, 1, constant_values=np.float32(beyond))
     if not values.min() < level < values.max():
         return np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64)
-    # scikit-image adds 2e-16 to every difference: scale by a power of two, or tiny fields are all epsilon.
+    # scikit-image adds 2e-16 to every difference, which would dominate tiny fields: scale by a power of two.
     exponent = int(np.frexp(float(values.max()) - float(values.min()))[1])
-    # It winds faces by the left hand: "ascent" turns them, by the right hand, away from what is higher.
+    # Its faces wind by the left hand: "ascent" orients them, by the right hand, away from higher values.
     index, faces, _, _ = marching_cubes(
         np.ldexp(values, -exponent), float(np.ldexp(level, -exponent)),
         gradient_direction="ascent" if inside == "above" else "descent",
@@ -86,19 +86,19 @@ def extract(volume: Volume, isovalue: float, inside: Side, capped: bool) -> tupl
 
 
 class Marchable(NamedTuple):
-    """All fields of a scene as flat arrays that a compiled kernel marches through, in the frame of the scene.
+    """All fields of a scene as flat arrays for marching by a compiled kernel, in the frame of the scene.
 
-    Every field is turned so that its solid is {v >= level}: for `inside` "below" v = -h and levels change sign too.
-    Their bricks serve every isovalue.
+    The sign of every field is such that its solid is {v >= level}: for `inside` "below", v = -h and levels change sign
+    too. The bricks serve every isovalue.
     """
 
-    values: NDArray[np.float32]  # all fields, one after the other, C order
-    start: NDArray[np.int64]  # (F,) where each begins
+    values: NDArray[np.float32]  # all fields concatenated, C order
+    start: NDArray[np.int64]  # (F,) offset of each field
     shape: NDArray[np.int64]  # (F, 3) voxels
     origin: Floats  # (F, 3) frame position of voxel 0
     spacing: Floats  # (F, 3)
     steps: NDArray[np.float32]  # (F, RANKS) as in `illumgrid.field.bricks`
-    bricks: NDArray[np.uint8]  # 128 bytes a brick, all fields, one after the other
+    bricks: NDArray[np.uint8]  # 128 bytes per brick, all fields concatenated
     brick_start: NDArray[np.int64]  # (F,) how many bricks come before
     brick_shape: NDArray[np.int64]  # (F, 3)
     albedo: Floats  # (F + Q, 3): fields, then quads
@@ -108,27 +108,27 @@ class Marchable(NamedTuple):
     quad_edges: Floats  # (Q, 2, 3)
     quad_duals: Floats  # (Q, 2, 3): dot with a point from the corner gives its shares (0 to 1) along the edges
     quad_normal: Floats  # (Q, 3) towards the front
-    quad_size: Floats  # (Q,) how large its edges are: rounding errors are a share of it
+    quad_size: Floats  # (Q,) size of its edges, the scale of rounding errors
     lamps: NDArray[np.int64]  # (L,) numbers of the quads that emit
-    lamp_share: Floats  # (L,) running sum of the probability to choose a lamp, in proportion to its power
-    lamp_density: Floats  # (Q,) probability to choose a point of the quad, per area; 0 if it does not emit
-    lamplight: Floats  # (3,) radiance of all lamps, were their power spread over a box around the scene
+    lamp_share: Floats  # (L,) cumulative probability of choosing a lamp, proportional to its power
+    lamp_density: Floats  # (Q,) probability density per area of choosing a point of the quad; 0 if it does not emit
+    lamplight: Floats  # (3,) radiance of all lamps if their power were spread over a box around the scene
 
 
 def turned(volume: Volume, inside: Side) -> NDArray[np.float32]:
-    """Values with the solid upwards; no copy where it is so already."""
+    """Values with the solid where they are high; no copy if that is so already."""
     return volume.values if UPWARD[inside] > 0 else -volume.values
 
 
 def marchable(scene: Scene) -> Marchable:
-    """Lay out a scene for marching, which takes a while: keep it. One field costs no copy of its values."""
+    """Lay out a scene for marching. This takes time, so keep the result. A single field is not copied."""
     parts = [turned(f.volume, f.inside) for f in scene.fields]
     values = [p.reshape(-1) for p in parts]
     bricks = [lay_bricks(p) for p in parts]
     records = [b.records.reshape(-1) for b in bricks]
     materials = [f.material for f in scene.fields] + [q.material for q in scene.quads]
     together = values[0].view() if len(parts) == 1 else np.concatenate(values)
-    together.setflags(write=False)  # as a lone volume is: else Numba compiles all kernels again, for another type
+    together.setflags(write=False)  # like a single volume: otherwise Numba compiles all kernels for a second type
     return Marchable(
         values=together,
         start=np.cumsum([0, *(len(v) for v in values)], dtype=np.int64)[:-1],
@@ -150,7 +150,7 @@ def _quads_in_frame(scene: Scene) -> dict[str, NDArray[Any]]:
     """The quad and lamp arrays of a `Marchable`."""
     axes, count = scene.fields[0].volume.direction, len(scene.quads)
     corner = scene.to_frame(np.array([q.corner for q in scene.quads]).reshape(count, 3))
-    # The front is a side in the world: where the axes are mirrored it is not edge_u x edge_v of the frame.
+    # The front is defined in the world: with mirrored axes it is not the side of edge_u x edge_v in the frame.
     normal = np.array([q.normal for q in scene.quads]).reshape(count, 3) @ axes
     edges = np.array([(q.edge_u, q.edge_v) for q in scene.quads]).reshape(count, 2, 3) @ axes
     across = np.cross(edges[:, ::-1], normal[:, None])
@@ -177,7 +177,7 @@ def _quads_in_frame(scene: Scene) -> dict[str, NDArray[Any]]:
 
 
 def turned_levels(scene: Scene, levels: Floats) -> Floats:
-    """Isovalues (..., F) as they are compared with the values of a `Marchable`: as stored, the solid upwards."""
+    """Isovalues (..., F) for comparison with the values of a `Marchable`: as stored, with the sign of `upward`."""
     sign = np.array([field.upward for field in scene.fields])
     stored = np.stack([f.volume.to_stored(levels[..., k]) for k, f in enumerate(scene.fields)], axis=-1)
     return np.asarray(stored * sign, np.float64)

@@ -1,6 +1,6 @@
-"""Stages by name, the package's own and those of other packages.
+"""Stages by name: those of the package itself and those of other packages.
 
-Names exist only here and above; everything below is handed objects.
+Only this layer and higher ones use names; lower layers receive objects.
 """
 
 import difflib
@@ -33,14 +33,14 @@ OWN = (
     "interpolators.splat",
     "interpolators.rbf",
 )
-"""The package's own files of stages: each has hooks, as the module of a plugin has. A new stage is one line here."""
+"""Modules with stages of the package itself, each with hooks like the module of a plugin. A new stage adds one line."""
 
 SWITCH = "ILLUMGRID_DISABLE_PLUGINS"
-"""Environment variable that switches plugins off: 1 for all, or names of packages joined by commas."""
+"""Environment variable that disables plugins: 1 for all, or names of packages joined by commas."""
 
 
 def auto_backend() -> str:
-    """Name of the backend that ``auto`` stands for."""
+    """Name of the backend that ``auto`` selects."""
     return "numba"
 
 
@@ -49,7 +49,7 @@ WHY_AUTO = "it marches level sets, so that none needs a mesh, and walked more pa
 
 
 class Kind(NamedTuple):
-    """A kind of stage: the hook that brings its classes, and its method, called as `call` shows (with self)."""
+    """A kind of stage: the hook that returns its classes, and its method with the arguments of `call` (with self)."""
 
     hook: str
     method: str
@@ -84,7 +84,7 @@ class Entry:
     stage : type
         A frozen dataclass.
     package, version : str
-        Where it comes from.
+        Its origin.
     """
 
     kind: str
@@ -94,17 +94,17 @@ class Entry:
     version: str
 
     def missing(self) -> str | None:
-        """None if the stage can run here, else what would make it so."""
+        """None if the stage can run here, otherwise the remedy."""
         ask = getattr(self.stage, "available", lambda: None)
         try:
             return cast(str | None, ask())
         except Exception as error:
-            return f"repair {self.package}, whose answer was {_told(error)}"
+            return f"repair {self.package}, whose answer was {_described(error)}"
 
 
 @dataclass(frozen=True)
 class _Plugin:
-    """Something with hooks: how to load it, and where it comes from."""
+    """A module with hooks: how to load it, and its origin."""
 
     module: str
     load: Callable[[], Any]
@@ -115,7 +115,7 @@ class _Plugin:
         return f"{self.package} {self.version} ({self.module})"
 
 
-def _told(error: BaseException) -> str:
+def _described(error: BaseException) -> str:
     return f"{type(error).__name__}: {' '.join(str(error).split())}" if str(error) else type(error).__name__
 
 
@@ -124,7 +124,7 @@ def _package_key(name: str) -> str:
 
 
 def _plugins(switch: str) -> Iterator[_Plugin]:
-    """Own stages first, then every entry point of the group that is not switched off; nothing is imported yet."""
+    """Own stages first, then every entry point of the group that is not disabled; nothing is imported yet."""
     for name in OWN:
         module = f"illumgrid.{name}"
         yield _Plugin(module, lambda m=module: importlib.import_module(m), "illumgrid", version("illumgrid"))  # type: ignore[misc]
@@ -136,7 +136,7 @@ def _plugins(switch: str) -> Iterator[_Plugin]:
 
 
 def _fault(kind: str, stage: Any) -> str | None:
-    """Why this is no stage of this kind; None if it is one."""
+    """Reason why this is not a stage of this kind; None if it is one."""
     what = getattr(stage, "__name__", repr(stage))
     name = getattr(stage, "name", None)
     method = getattr(stage, KINDS[kind].method, None)
@@ -170,14 +170,14 @@ def _fault(kind: str, stage: Any) -> str | None:
 
 @dataclass(frozen=True)
 class _Registry:
-    """All stages that were found, and a sentence on everything that could not be used."""
+    """All stages that were found, and a sentence on each fault."""
 
     entries: tuple[Entry, ...]
     faults: tuple[str, ...]
 
 
 def _hooked(plugin: _Plugin) -> Iterator[tuple[str, Any]]:
-    """Kind and class of what the hooks of a plugin return; in place of a class, a text that says what is wrong."""
+    """Kind and class of each stage that the hooks of a plugin return; for a fault, a text instead of a class."""
     manager = pluggy.PluginManager("illumgrid")
     manager.add_hookspecs(stages)
     hooks = {kind.hook: name for name, kind in KINDS.items()}
@@ -185,7 +185,7 @@ def _hooked(plugin: _Plugin) -> Iterator[tuple[str, Any]]:
         module = plugin.load()
         manager.register(module, plugin.module)
     except (Exception, SystemExit) as error:
-        yield "", f"it could not be loaded ({_told(error)})"
+        yield "", f"it could not be loaded ({_described(error)})"
         return
     callers = manager.get_hookcallers(module) or []
     if not callers:
@@ -199,12 +199,12 @@ def _hooked(plugin: _Plugin) -> Iterator[tuple[str, Any]]:
             for implementation in caller.get_hookimpls():
                 yield from ((hooks[caller.name], stage) for stage in cast(Any, implementation.function()))
         except (Exception, SystemExit) as error:
-            yield "", f"its hook {caller.name} failed ({_told(error)})"
+            yield "", f"its hook {caller.name} failed ({_described(error)})"
 
 
 @cache
 def _registry(switch: str) -> _Registry:
-    """Walk the plugins one by one, so that a broken one is named and harms no other."""
+    """Load the plugins one by one, so that a broken one is named and does not affect others."""
     entries: list[Entry] = []
     faults: list[str] = []
     for plugin in _plugins(switch):
@@ -212,7 +212,7 @@ def _registry(switch: str) -> _Registry:
             try:
                 fault = _fault(kind, found) if kind else found
             except Exception as error:  # such as a type that cannot be looked up
-                fault = f"{found!r} cannot be examined ({_told(error)})"
+                fault = f"{found!r} cannot be examined ({_described(error)})"
             if fault:
                 faults.append(f"the plugin {plugin} cannot be used in full: {fault}")
             elif all((e.kind, e.stage) != (kind, found) for e in entries):
@@ -230,7 +230,7 @@ def _claim(rivals: Sequence[Entry]) -> str:
     )
 
 
-_told_of: set[str] = set()
+_reported: set[str] = set()
 
 
 def entries() -> tuple[Entry, ...]:
@@ -239,12 +239,12 @@ def entries() -> tuple[Entry, ...]:
     Warns
     -----
     IllumgridWarning
-        Once in a process, of each plugin that is broken and each name that two packages claim.
+        Once per process, for each broken plugin and each name that two packages claim.
     """
     found = _registry(os.environ.get(SWITCH, ""))
     for fault in found.faults:
-        if fault not in _told_of:
-            _told_of.add(fault)
+        if fault not in _reported:
+            _reported.add(fault)
             tell("plugin", fault, stacklevel=2)
     return found.entries
 
@@ -255,7 +255,7 @@ def entry(kind: str, name: str) -> Entry:
     Raises
     ------
     BadInput
-        On a name that nobody claims, with the nearest one as a hint, or that two packages claim.
+        If the name is unknown (the message suggests the closest one), or claimed by two packages.
     """
     known = [e for e in entries() if e.kind == kind]
     wanted = auto_backend() if (kind, name) == ("backend", "auto") else name
@@ -282,7 +282,7 @@ def make(kind: str, name: str, values: dict[str, Any]) -> Any:
     Raises
     ------
     BadInput
-        On an unknown name or option, a value that its type does not take, or a stage that cannot run here.
+        On an unknown name or option, a value of the wrong type, or a stage that cannot run here.
     """
     found = entry(kind, name)
     types = {option.name: option.type for option in options.options(found.stage)}

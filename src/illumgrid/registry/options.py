@@ -23,7 +23,7 @@ class Option:
         bool, int (of 32 bits), float, str, a Literal of words, or a tuple of numbers.
     default : object
     meaning : str
-        What the class's docstring says of it, in one line.
+        Its description in the class's docstring, in one line.
     """
 
     name: str
@@ -39,7 +39,7 @@ def options(stage: type[Any]) -> tuple[Option, ...]:
 
 
 def _meanings(stage: type[Any]) -> dict[str, str]:
-    """First sentence on each parameter in a numpydoc docstring."""
+    """First sentence about each parameter in a numpydoc docstring."""
     _, _, section = inspect.cleandoc(stage.__doc__ or "").partition("Parameters\n----------\n")
     section = re.split(r"\n\S[^\n]*\n---+\n", section)[0]
     found = re.findall(r"^(\w+)\s*:[^\n]*\n((?:[ \t]+[^\n]*(?:\n|$)|\n)*)", section + "\n", re.MULTILINE)
@@ -47,7 +47,7 @@ def _meanings(stage: type[Any]) -> dict[str, str]:
 
 
 def expected(kind: Any) -> str | None:
-    """What a value of this type is, in words; None for a type that no option may have."""
+    """Description of values of this type; None for a type that options cannot have."""
     if kind in _NUMBERS:
         return _NUMBERS[kind]
     if kind is bool:
@@ -73,12 +73,12 @@ def short(kind: Any) -> str:
 
 
 def parse(option: str, value: Any, kind: Any) -> Any:
-    """Value of the type `kind` from a text, or from a number or sequence, which must say the same as a text would.
+    """Value of the type `kind` from a text, or from a number or sequence, which is converted to text first.
 
     Raises
     ------
     BadInput
-        If the type does not take it.
+        If it is not a value of this type.
     """
     text = ",".join(map(str, value)) if isinstance(value, Iterable) and not isinstance(value, str) else str(value)
     try:
@@ -94,7 +94,7 @@ def _value(text: str, kind: Any) -> Any:
     if kind is bool:
         return {"true": True, "false": False}[text.lower()] if text.lower() in ("true", "false") else _refuse()
     if kind is int:
-        return int(text) if abs(int(text)) < 2**31 else _refuse()  # counts: NumPy and the kernels take no more
+        return int(text) if abs(int(text)) < 2**31 else _refuse()  # the limit of NumPy and the kernels for counts
     if kind is float:
         return float(text) if not math.isnan(float(text)) else _refuse()
     parts = get_args(kind)

@@ -1,10 +1,10 @@
-"""Scenes whose light has a closed form: what every backend is judged by.
+"""Scenes whose light has a closed form, for testing backends.
 
-Each case says how far its surface, which is made of cells, may lie from the formula: a derived bound, not a fitted one.
-Spheres are level sets of -|x|², sampled at voxels a spacing s apart. Between voxels each term -x² becomes a chord, at
-most s²/4 below it. So the solid {h >= -R²} is a convex polyhedron with one facet a cell; it holds the ball of radius²
-R² - 3s²/4 and lies in that of radius R; marching cubes finds the same facets. Central differences of x², interpolated,
-are exact: the gradient normal is x/|x|. The facet's is that of its cell's middle, at most √3 s/2 away.
+Each case bounds the deviation of its discrete surface from the formula; the bounds are derived, not fitted. Spheres are
+level sets of -|x|², sampled at voxels of spacing s. Between voxels each term -x² becomes a chord, at most s²/4 below
+it. The solid {h >= -R²} is therefore a convex polyhedron with one facet per cell; it contains the ball of radius² R² -
+3s²/4 and lies in that of radius R; marching cubes finds the same facets. Interpolated central differences of x² are
+exact: the gradient normal is x/|x|. The normal of a facet is that at the centre of its cell, at most √3 s/2 away.
 """
 
 from dataclasses import dataclass, replace
@@ -18,30 +18,30 @@ from illumgrid.field.volume import Floats, Volume, index_to_world
 from illumgrid.transport.samples import Queries, join_queries
 from illumgrid.transport.stages import on_level_sets
 
-_TURN = np.array([[2.0, -1.0, 2.0], [2.0, 2.0, -1.0], [-1.0, 2.0, 2.0]]) / 3  # no axis of the array is one of the world
-_ROUNDING = 1e-6  # relative: an answer is float32
+_TURN = np.array([[2.0, -1.0, 2.0], [2.0, 2.0, -1.0], [-1.0, 2.0, 2.0]]) / 3  # no axis of the array is a world axis
+_ROUNDING = 1e-6  # relative: light is float32
 _RADIUS = 12.0  # of the spheres, in voxels
 _GRAY = np.array([0.8, 0.5, 0.2])
 
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """A scene, questions and their true answers.
+    """A scene, queries and their exact light.
 
     Parameters
     ----------
     expected : (n, 3) or (1, 3) float64
         Irradiance at each query; or, with `area`, one number for all of them.
     bound : (n,) or (1,) float64
-        How far the surface made of cells, and rounding, may move the answer from `expected`.
+        Largest deviation from `expected` by discretisation of the surface and rounding.
     area : (n,) float64, optional
         The formula holds for the sum of area · (E - kept · E of one bounce fewer). Queries come in pairs: two random
-        points of one cell of a surface, each of which stands for half of it.
+        points of one cell of a surface, each of which represents half of it.
     kept : (n, 3) float64, optional
-        Albedo where each query lies; without it the sum is that of area · E.
+        Albedo at each query; without it the sum is that of area · E.
     voxels : bool
-        The queries lie on voxels, each on the level set through itself. Of such a level set there may be no mesh (at a
-        peak it is a point): a question for those who march.
+        The queries lie on voxels, each on the level set through itself. Such a level set may have no mesh (at a peak it
+        is a point), so only backends that march are tested.
     """
 
     name: str
@@ -59,7 +59,7 @@ class Case:
 def _case(
     name: str, scene: Scene, queries: Queries, expected: ArrayLike, bounces: int, reason: str, bound: ArrayLike = 0.0
 ) -> Case:
-    """A case for each query; the rounding of the answer is added to the bound."""
+    """A case with a value for each query; rounding is added to the bound."""
     truth = np.broadcast_to(np.asarray(expected, float), (len(queries), 3))
     return Case(name, scene, queries, truth, bound + _ROUNDING * truth.max(axis=1), bounces, reason)
 
@@ -83,13 +83,13 @@ def on_quad(scene: Scene, number: int, level: float, shares: Floats, back: bool 
 
 
 def _pairs(cells: int, seed: int) -> Floats:
-    """Shares (2 cells², 2): two random points in each cell of a square cut into cells², one after the other."""
+    """Shares (2 cells², 2): two consecutive random points in each cell of a square divided into cells²."""
     corner = np.repeat(np.argwhere(np.ones((cells, cells))), 2, axis=0)
     return np.asarray((corner + np.random.default_rng(seed).random(corner.shape)) / cells)
 
 
 def ball(albedo: ArrayLike = 0.0, glows: bool = False) -> Field:
-    """Field -|x|² about the world's origin, s = 1, with a border of three voxels around the sphere of `_RADIUS`."""
+    """Field -|x|² around the world's origin, s = 1, with a border of three voxels around the sphere of `_RADIUS`."""
     x = np.arange(-_RADIUS - 3, _RADIUS + 4)
     values = -(x[:, None, None] ** 2 + x[:, None] ** 2 + x**2)
     limits = -((_RADIUS + np.array([1, -2])) ** 2)
@@ -97,7 +97,7 @@ def ball(albedo: ArrayLike = 0.0, glows: bool = False) -> Field:
 
 
 def _on_ball(scene: Scene, count: int) -> Queries:
-    """Queries even over the ball: a Fibonacci lattice."""
+    """Queries uniform over the ball: a Fibonacci lattice."""
     k = np.arange(count) + 0.5
     height, angle = 1 - 2 * k / count, np.pi * (1 + 5**0.5) * k
     ring = np.sqrt(1 - height**2)
@@ -106,7 +106,7 @@ def _on_ball(scene: Scene, count: int) -> Queries:
 
 
 def _dips() -> float:
-    """Largest share of directions, cosine about x/|x|, that dip under a facet of the ball.
+    """Largest share of directions, cosine-distributed around x/|x|, that point below a facet of the ball.
 
     The share is (1 - cos δ)/2 for an angle δ between the normals (the projection of the hemisphere's cap), and
     sin δ <= (√3 s/2)/|x| with |x|² >= R² - 3s²/4.
@@ -127,9 +127,9 @@ def _asked(scene: Scene, on_voxels: bool) -> Queries:
 def furnace(on_voxels: bool = False) -> Case:
     """White furnace: E = π(1 - a^(B+1)) to π, for any geometry.
 
-    Radiance 1 comes from everywhere: sky 1, surfaces of albedo a and emission 1 - a. A path that escapes is worth
-    Σ a^k (1 - a) + a^n = 1, one cut off after B reflections 1 - a^(B+1); so E lies between, and the bound is what is
-    between: π a^(B+1). The field is noise, over a floor that paths see from its front only.
+    Radiance 1 arrives from all directions: sky 1, surfaces of albedo a and emission 1 - a. A path that escapes
+    contributes Σ a^k (1 - a) + a^n = 1, one truncated after B reflections 1 - a^(B+1). E lies between these, and the
+    bound is their difference, π a^(B+1). The field is noise, over a floor that paths see from its front only.
     """
     albedo, bounces = np.array([0.5, 0.4, 0.2]), 21
     place = {"spacing": np.array([1.0, 0.7, 1.9]), "direction": _TURN * [1, 1, -1]}
@@ -146,7 +146,7 @@ def furnace(on_voxels: bool = False) -> Case:
 def cavity(on_voxels: bool = False) -> Case:
     """White furnace, sealed: E = π(1 - a^(B+1)) on every path, for any geometry.
 
-    A shell of solid voxels shuts noise in; the k-th of B + 1 meetings adds (1 - a) a^k. A leak shows a sky of 1000.
+    A shell of solid voxels encloses noise; the k-th of B + 1 hits adds (1 - a) a^k. A leak would show a sky of 1000.
     """
     bounces = 3
     values = np.pad(np.random.default_rng(4).random((7, 6, 8)), 1, constant_values=9.0)
@@ -158,20 +158,20 @@ def cavity(on_voxels: bool = False) -> Case:
 
 
 def furnace_on_voxels() -> Case:
-    """The white furnace asked where eight cells meet, each with its own side."""
+    """The white furnace with queries where eight cells meet, each with its own side."""
     return furnace(on_voxels=True)
 
 
 def cavity_on_voxels() -> Case:
-    """The sealed furnace asked where eight cells meet, each with its own side."""
+    """The sealed furnace with queries where eight cells meet, each with its own side."""
     return cavity(on_voxels=True)
 
 
 def glowing_box() -> Case:
     """White furnace, sealed by six walls that are lamps, a ball inside: E = π(1 - a^(B+1)) on ball and walls.
 
-    The same sum; here much of it comes from rays that ask the lamps, so that weights which do not add up to 1 show.
-    What dips under a facet of the ball is one reflection like all others: no discretisation error.
+    The sum is the same, but much of it comes from rays that sample the lamps, so that weights which do not add up to 1
+    are detected. A direction below a facet of the ball is one reflection like all others: no discretisation error.
     """
     bounces = 2
     field = ball(_GRAY, glows=True)
@@ -193,7 +193,7 @@ def plane() -> Case:
 
 
 def convex() -> Case:
-    """Black ball under a unit sky: E = π, less at most the share of directions that dip under its facets."""
+    """Black ball under a unit sky: E = π, minus at most the share of directions that point below its facets."""
     scene = Scene((ball(),), background=np.ones(3))
     return _case("ball, unit sky", scene, _on_ball(scene, 256), np.pi, 0, "E = π", np.pi * _dips())
 
@@ -227,7 +227,7 @@ def luminaire() -> Case:
 
 
 def _ground(height: float, half: float) -> Quad:
-    """Black square of half edge `half`, `height` below the middle of the ball, facing it."""
+    """Black square of half edge `half`, `height` below the centre of the ball, facing it."""
     u, v, up = _TURN.T * [[half], [half], [1.0]]
     return Quad("floor", -height * up - u - v, 2 * u, 2 * v, Material(np.zeros(3)))
 
@@ -235,9 +235,9 @@ def _ground(height: float, half: float) -> Quad:
 def shadow() -> Case:
     """Black floor beside a black ball under a unit sky: E = π(1 - (r/d)² cos θ).
 
-    The configuration factor of a sphere clear of the receiver's plane (J. R. Howell, "A catalog of radiation heat
-    transfer configuration factors", B-27). The polyhedron hides more than the ball within and less than the ball
-    around it: r² is R² - 3s²/8, give or take 3s²/8.
+    The configuration factor of a sphere that does not intersect the receiver's plane (J. R. Howell, "A catalog of
+    radiation heat transfer configuration factors", B-27). The polyhedron hides more than its inscribed ball and less
+    than its circumscribed one: r² = R² - 3s²/8 ± 3s²/8.
     """
     height = 1.5 * _RADIUS
     scene = Scene((ball(),), (_ground(height, 3 * _RADIUS),), np.ones(3))
@@ -252,9 +252,9 @@ def shadow() -> Case:
 def half_sky() -> Case:
     """Black ball over a wide black floor under a unit sky: E = π(1 + n·up)/2, the sky's share of a tilted plane.
 
-    A finite floor leaves a band of sky, ε below the horizon: tan ε = z/D, z the height of the point and D its distance
-    from the nearest edge. There n·ω is at most |n_h| cos φ + |n_z| sin ε, so the band adds at most
-    sin ε (2 |n_h| + 2π |n_z| sin ε). Directions that dip under a facet take at most what `_dips` says.
+    A finite floor leaves a band of sky, ε below the horizon: tan ε = z/D, with the height z of the point and its
+    distance D from the nearest edge. There n·ω is at most |n_h| cos φ + |n_z| sin ε, so the band adds at most
+    sin ε (2 |n_h| + 2π |n_z| sin ε). Directions below a facet subtract at most the share `_dips`.
     """
     half = 2000 * _RADIUS
     scene = Scene((ball(),), (_ground(1.25 * _RADIUS, half),), np.ones(3))
@@ -269,9 +269,9 @@ def half_sky() -> Case:
 def _slanted_box(albedo: Floats | None, cells: int = 16) -> tuple[Scene, Queries, Floats, Floats, Floats]:
     """The box with its lamp below a slanted plane: scene, pairs of queries on all of it, areas, albedos, power.
 
-    The volume is wider than the box, so that its level set ends at the walls and no cap is seen; walls go on into the
-    solid, where queries are holes and count as 0. The field is linear: no discretisation error. All surfaces have
-    `albedo`, or each its own and the front wall none: what it takes is what would escape through an open front.
+    The volume is wider than the box, so that its level set ends at the walls and no cap is visible; walls continue into
+    the solid, where queries are holes and count as 0. The field is linear: no discretisation error. All surfaces have
+    `albedo`, or each its own and the front wall 0: it absorbs what would escape through an open front.
     """
     right, _, up = upright(_TURN)
     slopes = np.round(4 * (up + 0.25 * right) @ _TURN) / 4
@@ -284,7 +284,7 @@ def _slanted_box(albedo: Floats | None, cells: int = 16) -> tuple[Scene, Queries
         own = np.zeros(3) if quad.name == "front" else quad.material.albedo
         quads.append(replace(quad, material=Material(own if albedo is None else albedo, quad.material.emission)))
     scene = Scene((field,), tuple(quads))
-    # The plane over the floor's parallelogram: each of its points is moved up along the box.
+    # The plane over the floor's parallelogram: each point of the floor is moved up along the box.
     floor, slope = scene.quads[0], _TURN @ slopes
     edges = np.stack([floor.edge_u, floor.edge_v])
     edges = edges - (edges @ slope / (up @ slope))[:, None] * up
@@ -304,7 +304,7 @@ def _slanted_box(albedo: Floats | None, cells: int = 16) -> tuple[Scene, Queries
 def gray_box() -> Case:
     """Sealed cavity, all of albedo a, with a lamp of power Φ: ∫ E dA = Φ (1 - a^(B+1)) / (1 - a).
 
-    What arrives is Φ at first, and a times as much after each reflection, wherever it goes. The lamp has two sides.
+    The arriving power is Φ at first, and is multiplied by a at each reflection. The lamp has two sides.
     """
     bounces, reason = 4, "∫ E dA = Φ(1 - a^(B+1))/(1 - a)"
     scene, queries, area, _, power = _slanted_box(_GRAY)
@@ -314,10 +314,10 @@ def gray_box() -> Case:
 
 
 def balance() -> Case:
-    """Energy balance in the coloured box: Φ = Σ (1 - a) ∫ E dA + what escapes + what is cut off after B reflections.
+    """Energy balance in the coloured box: Φ = Σ (1 - a) ∫ E dA + escaped power + power truncated after B reflections.
 
-    The cut off part is the light of B reflections that the walls would send on: Σ a ∫ (E_B - E_(B-1)) dA; together
-    Φ = Σ ∫ (E_B - a E_(B-1)) dA.
+    The truncated part is the light of B reflections that the walls would reflect again: Σ a ∫ (E_B - E_(B-1)) dA;
+    together Φ = Σ ∫ (E_B - a E_(B-1)) dA.
     """
     scene, queries, area, kept, power = _slanted_box(None)
     bound, reason = np.array([_ROUNDING * power.max()]), "Φ = Σ ∫ (1 - a)E dA + escaped + cut off"

@@ -1,4 +1,4 @@
-"""The questions put to a light-transport backend, and its answers."""
+"""Queries to a light-transport backend, and the samples that it returns."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -19,18 +19,18 @@ _Solve = TypeVar("_Solve", bound=Callable[..., "Samples"])
 
 @dataclass(frozen=True, eq=False)
 class Queries:
-    """Points that ask for their light, each on the level set of its own row of levels.
+    """Points at which light is wanted, each on the level set of its own row of levels.
 
     Parameters
     ----------
     id : (n,) uint64
-        Unique over a run: the random numbers of a query depend on it and on nothing else that a batch could change.
+        Unique over a run: the random numbers of a query depend on its id and not on the batch.
     point : (n, 3) float64
         World positions, on the trilinear level set of the row.
     normal : (n, 3) float64
-        World unit gradient normals, towards the outside; (0, 0, 0) marks a hole: no light is asked for.
+        World unit gradient normals, pointing outside; (0, 0, 0) marks a hole, which receives no light.
     level : (n, F) float64
-        The isovalue of every field of the scene while this query is answered.
+        The isovalue of every field of the scene for this query.
     target : (n,) int32
         Number of the field on whose level set the point lies.
     """
@@ -51,7 +51,7 @@ class Queries:
     def at(
         scene: Scene, points: ArrayLike, field: int = 0, level: float | ArrayLike | None = None, first_id: int = 0
     ) -> "Queries":
-        """Ask at world points (n, 3), each on the level set through itself, or all on `level`.
+        """Queries at world points (n, 3), each on the level set through itself, or all on `level`.
 
         Parameters
         ----------
@@ -62,9 +62,9 @@ class Queries:
             Number of the field on whose level sets the points lie.
         level : float or (n,) array_like, optional
             Isovalue, one for all or one each: the points are projected onto that level set by Newton steps along the
-            gradient. The other fields take the isovalue of the same place in the common sweep.
+            gradient. The other fields take the isovalue at the same position of the common sweep.
         first_id : int
-            Id of the first query; the others count up.
+            Id of the first query; the following ids count up.
 
         Returns
         -------
@@ -73,9 +73,9 @@ class Queries:
         """
         world = np.asarray(points, dtype=float).reshape(-1, 3)
         if not 0 <= field < len(scene.fields):
-            raise BadInput(f"field {field} was asked for; expected a number from 0 to {len(scene.fields) - 1}")
+            raise BadInput(f"the field number is {field}; expected a number from 0 to {len(scene.fields) - 1}")
         own = scene.fields[field]
-        index = world_to_index(own.volume, np.where(np.isfinite(world), world, np.nan))  # an infinity is nowhere
+        index = world_to_index(own.volume, np.where(np.isfinite(world), world, np.nan))  # infinite points are nowhere
         top = np.array(own.volume.shape) - 1
         good = np.asarray((np.isfinite(index) & (index >= 0) & (index <= top)).all(axis=1))
         index = np.where(good[:, None], index, 0.0)
@@ -98,18 +98,19 @@ class Queries:
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """Answers: the irradiance at each query, with its own error.
+    """Irradiance at each query, with its own error.
 
     Parameters
     ----------
     queries : Queries
     mean : (n, C) float32
-        Irradiance in C channels, never clamped: π times the mean worth of a cosine-distributed path. Kept as `light`;
-        the attribute `mean` is its linear RGB, (n, 3).
+        Irradiance in C channels, never clamped: π times the mean contribution of cosine-distributed paths. Stored as
+        `light`; the attribute `mean` is its linear RGB, (n, 3).
     m2 : (n, C) float32
-        Spread of the mean, as paths (paths - 1) stderr²: for independent paths the sum of squared deviations; here from
-        the differences of paths that share a box of their net, so that it measures noise and not the change of light
-        over the hemisphere, and from what so few paths may have missed. Kept as `spread`; `m2` is that of RGB, (n, 3).
+        Equal to paths (paths - 1) stderr², which for independent paths is the sum of squared deviations. Backends of
+        this package estimate it from differences within strata of the Sobol' net, so smooth variation over the
+        hemisphere is not counted as noise, plus an allowance for light that so few paths may have missed. Stored as
+        `spread`; `m2` is that of RGB, (n, 3).
     paths : (n,) int32
         Number of paths; 0 marks a hole, whose mean and m2 are 0.
     channels : Channels, optional
@@ -118,7 +119,7 @@ class Samples:
     Attributes
     ----------
     light, spread : (n, C) float32
-        What is stored; `mean` and `m2` are read-only views of them.
+        The stored arrays; `mean` and `m2` are read-only views of them.
     """
 
     queries: Queries
@@ -163,21 +164,21 @@ class Samples:
 
 
 def check_request(paths: range, bounces: int) -> None:
-    """Refuse what no backend can answer.
+    """Refuse requests that no backend can answer.
 
     Raises
     ------
     BadInput
-        On paths that do not count up by one, or bounces below 0.
+        If `paths` does not count up by one, or `bounces` is negative.
     """
     if not isinstance(paths, range) or paths.step != 1 or paths.start < 0:
         raise BadInput(f"paths is {paths!r}; expected a range of path numbers from 0 up with step 1, such as range(64)")
     if bounces < 0:
-        raise BadInput(f"{bounces} bounces were asked for; expected 0 (light straight from the sky) or more")
+        raise BadInput(f"{bounces} bounces were requested; expected 0 (light straight from the sky) or more")
 
 
 def combine(one: Samples, other: Samples) -> Samples:
-    """Merge the answers of two disjoint ranges of paths to the same queries, as if independent.
+    """Merge the samples of two disjoint ranges of paths for the same queries, as if independent.
 
     References
     ----------
@@ -196,7 +197,7 @@ def combine(one: Samples, other: Samples) -> Samples:
 
 
 def _in_common(parts: Sequence[Samples]) -> tuple[Channels, list[NDArray[np.float32]], list[NDArray[np.float32]]]:
-    """Light and spread of samples in channels that all have: RGB where they differ."""
+    """Light and spread of samples in common channels: RGB where they differ."""
     channels = parts[0].channels
     if all(part.channels == channels for part in parts):
         return channels, [part.light for part in parts], [part.spread for part in parts]
@@ -204,11 +205,11 @@ def _in_common(parts: Sequence[Samples]) -> tuple[Channels, list[NDArray[np.floa
 
 
 LONGEST = 1 << 16
-"""Paths that a backend of this package follows in one go: it keeps what each is worth."""
+"""Largest number of paths that a backend of this package traces at once, since it stores each contribution."""
 
 
 def in_turn(solve: _Solve) -> _Solve:
-    """Check what is asked of a `Tracer.solve`, and have it answer no more than `LONGEST` paths at once."""
+    """Check the arguments of a `Tracer.solve`, and call it with at most `LONGEST` paths at once."""
 
     @wraps(solve)
     def checked(self: Any, queries: Queries, *, paths: range, bounces: int, seed: int) -> Samples:
@@ -220,20 +221,20 @@ def in_turn(solve: _Solve) -> _Solve:
 
 
 def join_queries(parts: Sequence[Queries]) -> Queries:
-    """One after the other."""
+    """Concatenate batches of queries."""
     return Queries(
         *(np.concatenate([getattr(p, n) for p in parts]) for n in ("id", "point", "normal", "level", "target"))
     )
 
 
 def join_samples(parts: Sequence[Samples]) -> Samples:
-    """One after the other."""
+    """Concatenate batches of samples."""
     channels, light, spread = _in_common(parts)
     queries, paths = join_queries([p.queries for p in parts]), np.concatenate([p.paths for p in parts])
     return Samples(queries, np.concatenate(light), np.concatenate(spread), paths, channels)
 
 
 def in_frame(scene: Scene, queries: Queries) -> tuple[Floats, Floats, Floats]:
-    """Points (n, 3) and normals (n, 3) of queries in the frame of the scene, and their levels (n, F) turned upward."""
+    """Points (n, 3) and normals (n, 3) of queries in the frame of the scene, and their levels (n, F) times `upward`."""
     axes = scene.fields[0].volume.direction
     return scene.to_frame(queries.point), queries.normal @ axes, turned_levels(scene, queries.level)

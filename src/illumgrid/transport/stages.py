@@ -1,11 +1,11 @@
-"""The three stages that can be exchanged, and all that their authors need.
+"""Protocols of the three exchangeable stages, and everything that their authors need.
 
 A stage is a frozen dataclass with a class attribute ``name``; its fields are its options, each with a default, of type
 bool, int, float, str, a ``Literal`` of words, or a tuple of numbers. It may have a class method ``available``, which
-returns None where the stage can run, and else what would make it so, such as ``"pip install embreex"``.
+returns None if the stage can run, and otherwise the remedy, such as ``"pip install embreex"``.
 
-A package brings stages by hooks, functions marked with `hookimpl`, in a module that its entry point of the group
-``illumgrid`` names.
+A package provides stages by hooks, functions marked with `hookimpl`, in the module named by its entry point in the
+group ``illumgrid``.
 """
 
 import inspect
@@ -37,14 +37,14 @@ __all__ = [
 ]
 
 hookimpl = pluggy.HookimplMarker("illumgrid")
-"""Marks a function as one of the hooks below; the function's name says which."""
+"""Marks a function as one of the hooks below, selected by the function's name."""
 
 _hookspec = pluggy.HookspecMarker("illumgrid")
 
 
 @runtime_checkable
 class Sampler(Protocol):
-    """Where to ask for light."""
+    """Chooses the points at which light is computed."""
 
     name: ClassVar[str]
 
@@ -55,7 +55,7 @@ class Sampler(Protocol):
         ----------
         scene : Scene
         specs : sequence of GridSpec
-            The nodes to be filled, one lattice a field.
+            The nodes to be filled, one lattice per field.
         seed : int
             Equal seeds give equal queries.
         """
@@ -63,10 +63,10 @@ class Sampler(Protocol):
 
 @runtime_checkable
 class Backend(Protocol):
-    """Light transport: answers the questions.
+    """Light transport: computes the light at queries.
 
-    A backend that answers with something other than light, such as a share of the sky that is not hidden, says so by a
-    class attribute ``transport = False``: closed forms of light are then no measure of it.
+    A backend that computes something other than light, such as ambient occlusion, sets the class attribute
+    ``transport = False``; it is then not tested against closed forms of light.
     """
 
     name: ClassVar[str]
@@ -75,7 +75,7 @@ class Backend(Protocol):
     def solve(self, scene: Scene, queries: Queries, *, paths: range, bounces: int, seed: int) -> Samples:
         """Trace the paths with these numbers from every query.
 
-        The answer to a query depends on its id, `paths`, `bounces` and `seed`, never on the batch it came in.
+        The result of a query depends on its id, `paths`, `bounces` and `seed`, never on its batch.
 
         Parameters
         ----------
@@ -97,11 +97,11 @@ class Capabilities:
     Parameters
     ----------
     surface : {"levelset", "mesh"}
-        What stands for a level set in its answers.
+        Representation of a level set that it uses.
     transport : bool
-        Whether the answers are light.
+        Whether it computes light.
     variants : tuple of str
-        Surfaces that its option ``surface`` chooses between; empty if it has no such option.
+        Surfaces that its option ``surface`` selects; empty if it has no such option.
     """
 
     surface: Literal["mesh", "levelset"]
@@ -110,7 +110,7 @@ class Capabilities:
 
 
 def capabilities(backend: Any) -> Capabilities:
-    """What a backend, or its class, can do: read from ``geometry``, ``transport`` and the option ``surface``.
+    """Capabilities of a backend or its class, read from ``geometry``, ``transport`` and the option ``surface``.
 
     Raises
     ------
@@ -131,7 +131,7 @@ def capabilities(backend: Any) -> Capabilities:
 
 @runtime_checkable
 class Interpolator(Protocol):
-    """From scattered answers to a uniform grid."""
+    """From scattered samples to a uniform grid."""
 
     name: ClassVar[str]
 
@@ -141,14 +141,14 @@ class Interpolator(Protocol):
         Parameters
         ----------
         samples : Samples
-            All of them on level sets of the nodes' field; holes (paths 0) among them.
+            On level sets of the nodes' field; they may include holes (paths 0).
         nodes : Nodes
-            The lattice and the field; by blocks, the point, normal and level of every node.
+            The lattice and the field, and in blocks the point, normal and level of every node.
         """
 
 
 def fill_nodes(interpolator: Interpolator, samples: Samples, nodes: Nodes) -> IlluminationGrid:
-    """Fill nodes by an interpolator; one that has the former signature, ``fill(samples, spec, field)``, gets those."""
+    """Fill nodes by an interpolator, which may have the former signature ``fill(samples, spec, field)``."""
     try:
         inspect.signature(interpolator.fill).bind("samples", "spec", "field")
     except TypeError:
@@ -180,7 +180,7 @@ def on_level_sets(
     specs: Sequence[GridSpec] | None = None,
     points: int | None = None,
 ) -> Iterator[Queries]:
-    """Queries on every field's level set of each row of `levels`, uniform by area, projected on the trilinear set.
+    """Queries on every field's level set of each row of `levels`, uniform by area, projected onto the trilinear set.
 
     Parameters
     ----------
@@ -190,14 +190,14 @@ def on_level_sets(
     seed : int
         Equal seeds give equal points.
     specs : sequence of GridSpec, optional
-        One a field: their node spacing sets the default number of points; without it the voxel spacing does.
+        One per field. The node spacing determines the default number of points; without `specs` the voxel spacing does.
     points : int, optional
-        Points on each level set; by default one for each squared spacing, at least 64.
+        Points on each level set; by default one per squared spacing, at least 64.
 
     Yields
     ------
     Queries
-        One batch for each row and field whose level set is not empty; ids count up within a field, over all rows.
+        One batch per row and field whose level set is not empty; ids count up within a field, over all rows.
     """
     rows = np.asarray(levels, dtype=float)
     if rows.ndim == 1:

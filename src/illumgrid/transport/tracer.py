@@ -1,4 +1,4 @@
-"""A backend with a scene set up: what a scene costs to prepare is paid once, and owned by whoever holds the tracer."""
+"""A backend set up for a scene: the setup runs once, and its data belong to the tracer."""
 
 from dataclasses import dataclass
 from typing import Any, Protocol, cast
@@ -31,16 +31,16 @@ class _Unprepared:
 
 
 def prepare(backend: Backend, scene: Scene) -> Tracer:
-    """Set a scene up for a backend; one that has no method ``prepare`` is asked by its ``solve``."""
+    """Set up a scene for a backend; a backend without a method ``prepare`` is called by its ``solve``."""
     own = getattr(backend, "prepare", None)
     return cast(Tracer, own(scene)) if own else _Unprepared(backend, scene)
 
 
 def laid_out(scene: Scene) -> tuple[Channels, Marchable]:
-    """The channels that a scene needs, and the scene to march through, with albedos and light for each of them.
+    """Channels of a scene, and the scene laid out for marching, with albedos and light per channel.
 
-    All channels are filled from the same paths. A channel has the first colour that it adds to; one of several lights
-    would have the emission of that light only.
+    All channels use the same paths. A channel has the first colour that it adds to; the channel of one of several
+    lights would have the emission of that light only.
     """
     channels, fields = channels_of(scene), marchable(scene)
     color = [int(np.argmax(row)) for row in channels.mix]
@@ -50,6 +50,6 @@ def laid_out(scene: Scene) -> tuple[Channels, Marchable]:
 
 
 def solve_once(backend: Any, scene: Scene, queries: Queries, *, paths: range, bounces: int, seed: int) -> Samples:
-    """Set a scene up and answer once: the method ``solve`` of a backend that has ``prepare``."""
+    """Set up a scene and solve once: the method ``solve`` of a backend with ``prepare``."""
     answer: Samples = backend.prepare(scene).solve(queries, paths=paths, bounces=bounces, seed=seed)
     return answer
