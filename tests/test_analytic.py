@@ -68,7 +68,7 @@ class Broken:
             empty = np.where(rows[:, None], 0, answer.mean), np.where(rows[:, None], 0, answer.m2)
             answer = Samples(queries, *empty, np.where(rows, 0, answer.paths))
         if self.mistake == "one query":
-            answer.mean[-1] *= 1.5
+            answer.light[-1] *= 1.5
         return answer
 
 
