@@ -38,7 +38,7 @@ from illumgrid.accuracy.judge import judge
 from illumgrid.accuracy.points import unseen_in_volume, unseen_on_level_sets
 from illumgrid.accuracy.reference import begin, converge, errors, look_up
 from illumgrid.bake import Bake
-from illumgrid.cli.bench import files
+from illumgrid.cli.report import files
 from illumgrid.field.scene import level_table
 from illumgrid.field.volume import smooth
 from illumgrid.transport.tracer import prepare
@@ -247,7 +247,10 @@ def volumes(asked):
             "truth": exact.error, "least": min(e for p, e in error.items() if p.method.surface == "levelset"),
             "advice": advice,
         }  # fmt: skip
-        better = [f"{p.label} {p.grid} x {p.paths} ({p.time:.1f} s, {error[p]:.2%})" for p in dominating]
+        better = [
+            f"{p.method.label(p.interpolator)} {p.grid} x {p.paths} ({p.time:.1f} s, {error[p]:.2%})"
+            for p in dominating
+        ]
         least = found[name]["least"]
         print(f"  {name:20} default {'' if default.built else '~'}{took:.1f} s {rmse:7.2%}; dominated by "
               f"{', '.join(better) or 'none'}; reference {exact.error:.2%}, "

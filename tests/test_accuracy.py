@@ -4,19 +4,21 @@ import numpy as np
 import pytest
 
 from illumgrid import run
-from illumgrid.accuracy.choose import Goal, Plan, choose, planned, rounds, sizes
+from illumgrid.accuracy.choose import Goal, Plan, choose, planned, sizes
 from illumgrid.accuracy.cost import Pace
 from illumgrid.accuracy.judge import judge
 from illumgrid.accuracy.parts import Parts, parts_of
 from illumgrid.accuracy.points import other_paths, unseen_in_volume, unseen_on_level_sets
-from illumgrid.accuracy.probe import Measured, Probe, corners
+from illumgrid.accuracy.probe import Measured, Probe
 from illumgrid.accuracy.reference import Reference, begin, converge, errors, look_up
 from illumgrid.backends.numba_ import Numba
 from illumgrid.bake import Bake
+from illumgrid.chain import rounds
 from illumgrid.field.lattice import specs_over
 from illumgrid.field.scene import Scene, level_table
 from illumgrid.field.volume import interpolate, world_to_index
 from illumgrid.grid import IlluminationGrid
+from illumgrid.samplers.direct import corners
 from illumgrid.transport.samples import Queries, Samples
 from illumgrid.transport.tracer import prepare
 from shapes import ball, refused, sampled, sky

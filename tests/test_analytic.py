@@ -7,12 +7,13 @@ import pytest
 
 from illumgrid import cli, registry
 from illumgrid.accuracy import verify
-from illumgrid.accuracy.verify import check, judge, sidak
+from illumgrid.accuracy.verify import check
 from illumgrid.backends.numba_ import Numba
 from illumgrid.errors import BadInput
 from illumgrid.field.scene import Material, Quad
 from illumgrid.field.volume import interpolate, world_to_index
 from illumgrid.transport import analytic
+from illumgrid.transport.agreement import judge, line, sidak
 from illumgrid.transport.samples import Queries, Samples
 
 
@@ -26,7 +27,7 @@ def test_a_backend_agrees_with_every_closed_form(name, cases):
     paths = {"embree": 1 << 18, "reference": 1 << 18}.get(name, 1 << 20)
     rows = list(check([name], paths=paths, seed=1, cases=cases))
     assert len(rows) == sum(not case.voxels or name in ("numba:levelset", "reference") for case in cases)
-    assert all(row.agrees for row in rows), "\n".join(map(verify.line, rows))
+    assert all(row.agrees for row in rows), "\n".join(map(line, rows))
 
 
 def darker(material, albedo=1.0, emission=1.0):
@@ -91,8 +92,8 @@ FINDS = {
 @pytest.mark.parametrize("mistake", FINDS)
 def test_a_mistake_is_found_at_the_default_number_of_paths(mistake, surface, cases):
     rows = list(check([Broken(mistake, surface)], cases=[case for case in cases if case.name in FINDS[mistake]]))
-    assert [row.scene for row in rows if not row.agrees] == FINDS[mistake], "\n".join(map(verify.line, rows))
-    assert all("DISAGREES" in verify.line(row) for row in rows)
+    assert [row.scene for row in rows if not row.agrees] == FINDS[mistake], "\n".join(map(line, rows))
+    assert all("DISAGREES" in line(row) for row in rows)
 
 
 def test_lamberts_formula_is_the_integral_over_the_lamp():

@@ -12,7 +12,7 @@ import pytest
 
 from illumgrid import registry
 from illumgrid import run as run_chain
-from illumgrid.accuracy.chart import _references, _remarks, _show_default, _thinned, _tracer_of, bench, report
+from illumgrid.accuracy.chart import _references, _remarks, _show_default, _thinned, _tracer_of, bench
 from illumgrid.accuracy.chart import sizes as sizes_of
 from illumgrid.accuracy.chart.methods import COUNTS, Method, methods, tracers
 from illumgrid.accuracy.chart.race import Point, Race, Run, covered, front
@@ -20,7 +20,8 @@ from illumgrid.accuracy.cost import Pace
 from illumgrid.accuracy.points import unseen_on_level_sets
 from illumgrid.accuracy.reference import begin, errors
 from illumgrid.backends.numba_ import Numba
-from illumgrid.cli.bench import table
+from illumgrid.cli import report
+from illumgrid.cli.report import table
 from illumgrid.field.scene import Field, Scene
 from illumgrid.field.volume import world_to_index
 from illumgrid.interpolators.nearest import Nearest
@@ -85,7 +86,7 @@ def test_a_race_goes_from_cheap_to_dear_and_keeps_its_seeds(truth):
         race.advance(contestant)
         assert len(race.points) < 60
     ways = {"direct, numba (levelset), nearest", "uniform 8, numba (levelset), nearest"}
-    assert {p.label for p in race.points} >= ways
+    assert {p.method.label(p.interpolator) for p in race.points} >= ways
     assert {p.grid for p in race.points if p.method is METHOD} == {4, 7}
     for p in race.points:
         assert len(p.light) == 1 and p.light[0].shape == (len(exact), 3) and p.seconds[0] > 0

@@ -2,7 +2,7 @@
 
 import os
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, replace
 from importlib.metadata import version
 from typing import Any
@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 
 from illumgrid import registry
-from illumgrid.accuracy.choose import planned, rounds
+from illumgrid.accuracy.choose import JUDGED, Plan, planned
 from illumgrid.accuracy.judge import judge as measure_error
+from illumgrid.accuracy.probe import FEWEST_PATHS, MOST_PATHS
 from illumgrid.bake import Map, Progress, bake, enough_bounces, light_left_out
 from illumgrid.constants import PATHS
 from illumgrid.errors import BadInput, tell
@@ -194,6 +195,21 @@ def judged(light: Illumination, backend: Backend) -> Illumination:
 def _shines(scene: Scene) -> bool:
     materials = [field.material for field in scene.fields] + [quad.material for quad in scene.quads]
     return bool(scene.background.any() or any(m.emission.any() for m in materials))
+
+
+def rounds(plan: Plan, until: float, clock: Callable[[], float] = time.perf_counter) -> Iterator[range]:
+    """Paths for a run that is to end at a time: a quarter of the plan's, then as many as their pace leaves time for.
+
+    The probe times a few thousand paths, which is good enough to choose a grid but, on a machine that does other things
+    as well, not to promise a time.
+    """
+    begun, done, more = clock(), 0, max(FEWEST_PATHS, 2 * (plan.paths // 8))
+    after = plan.fill + (1 - JUDGED) * (until - begun)
+    while more >= max(2, done // 16) and done < MOST_PATHS:
+        yield range(done, done + more)
+        done += more
+        now = clock()
+        more = 2 * int((until - after - now) * done / (now - begun) / 2)
 
 
 def _check_plannable(error: float | None, seconds: float | None, sampler: Any, backend: Any, interpolator: Any) -> None:

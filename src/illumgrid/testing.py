@@ -12,12 +12,12 @@ from typing import Any, ClassVar, cast
 
 import numpy as np
 
-from illumgrid.accuracy.verify import applies, judge, line, sidak
 from illumgrid.field.scene import Field, Material, Quad, Scene
 from illumgrid.field.volume import Floats, Volume, interpolate, outward_normals, world_to_index
 from illumgrid.grid import GridSpec, IlluminationGrid, Nodes
 from illumgrid.registry.options import expected, options
 from illumgrid.stages import on_level_sets
+from illumgrid.transport.agreement import applies, judge, line, sidak
 from illumgrid.transport.analytic import CASES, on_quad
 from illumgrid.transport.samples import Queries, Samples, combine, join_queries
 from illumgrid.transport.stages import capabilities, fill_nodes

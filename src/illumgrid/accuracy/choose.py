@@ -1,7 +1,7 @@
 """No more than a scene needs: nodes, paths and bounces for an asked error or time, from a short probe."""
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -24,21 +24,11 @@ MOST_NODES = 40_000_000  # a grid of about 2 GB with all that belongs to it
 
 @dataclass(frozen=True)
 class Goal:
-    """What is asked of a run, and what is not left to choose.
+    """What is asked of a run, and what is not left to choose."""
 
-    Parameters
-    ----------
-    error : float, optional
-        Relative root mean square error to reach in the least time; else the least error in `seconds`.
-    seconds : float
-    texels : int
-        Of the walls, which take their time too.
-    paths, bounces : int, optional
-    """
-
-    error: float | None = None
+    error: float | None = None  # relative, root mean square, to reach in the least time; else the least in `seconds`
     seconds: float = np.inf
-    texels: int = 0
+    texels: int = 0  # of the walls, which take their time too
     paths: int | None = None
     bounces: int | None = None
 
@@ -60,34 +50,17 @@ class Choice:
 
 @dataclass(frozen=True)
 class Plan:
-    """What the probe chose, and why.
-
-    Parameters
-    ----------
-    grid, paths, bounces : int
-    error : float
-        Predicted relative error.
-    seconds : float
-        Predicted time of the run.
-    fill : float
-        Seconds of those that go into queries and grids, not into paths.
-    pilot : float
-        Seconds that the probe took.
-    met : bool
-        Whether the asked error, or time, is predicted to be kept.
-    why : tuple of str
-        Sentences for the user.
-    """
+    """What the probe chose, and why."""
 
     grid: int
     paths: int
     bounces: int
-    error: float
-    seconds: float
-    fill: float
-    pilot: float
-    met: bool
-    why: tuple[str, ...]
+    error: float  # predicted, relative
+    seconds: float  # predicted, of the run
+    fill: float  # seconds of those that go into queries and grids, not into paths
+    pilot: float  # seconds that the probe took
+    met: bool  # whether the asked error, or time, is predicted to be kept
+    why: tuple[str, ...]  # sentences for the user
 
 
 def sizes(scene: Scene) -> list[int]:
@@ -177,9 +150,9 @@ class Search:
         goal, chosen = self.goal, look.choice.measured.grid
         near = [size for size in sizes if 0.6 < size / chosen < (1.7 if goal.error is None else np.inf)]
         each = self.pace.path * (2 * 8 * TRIAL_PATHS * len(near[:3]) + REFERENCE_COST * 128)  # seconds a point
-        more = min(8192, int(min(8192.0, look.choice.seconds / 6 / each))) if goal.error is None else 4096
-        if goal.error is None and late:  # the first look was slow: what is left is for the run
-            return look
+        more = 4096
+        if goal.error is None:  # after a slow first look, what is left is for the run
+            more = 0 if late else int(min(8192.0, look.choice.seconds / 6 / each))
         while more > 1.5 * look.points:
             error, bounces = goal.error or look.choice.error, None
             if goal.error is None:  # by the few points of the first look: more would take too long
@@ -204,22 +177,10 @@ def planned(
     bounces: int | None = None,
     seed: int = 0,
 ) -> Plan:
-    """Choose nodes, paths and bounces of a run with `Direct` and `Nearest`.
+    """Choose nodes, paths and bounces of a run with `Direct` and `Nearest`, as far as they are not given.
 
-    Parameters
-    ----------
-    scene : Scene
-    backend : Backend
-        One that marches level sets.
-    levels : Levels
-        Rows at which walls are lit, which takes its time too.
-    error : float, optional
-        Relative root mean square error to reach, in the least time.
-    seconds : float, optional
-        Time to use, this choice included, for the least error.
-    grid, paths, bounces : int, optional
-        What is not left to choose.
-    seed : int
+    In the least time for a relative root mean square `error`, or the least error in `seconds`, with this choice and the
+    light of walls at `levels` included; `backend` marches level sets.
     """
     begun, tracer = time.perf_counter(), prepare(backend, scene)
     left = np.inf if seconds is None else JUDGED * seconds
@@ -252,18 +213,3 @@ def reasons(scene: Scene, choice: Choice, bounces: int, left_out: float) -> tupl
         f"{bounces} bounces: further ones would add {left_out:.1%}",
         f"{nodes - m.nodes} of {nodes} nodes are omitted: no isosurface of the range is near them",
     )
-
-
-def rounds(plan: Plan, until: float, clock: Callable[[], float] = time.perf_counter) -> Iterator[range]:
-    """Paths for a run that is to end at a time: a quarter of the plan's, then as many as their pace leaves time for.
-
-    The probe times a few thousand paths, which is good enough to choose a grid but, on a machine that does other things
-    as well, not to promise a time.
-    """
-    begun, done, more = clock(), 0, max(FEWEST_PATHS, 2 * (plan.paths // 8))
-    after = plan.fill + (1 - JUDGED) * (until - begun)
-    while more >= max(2, done // 16) and done < MOST_PATHS:
-        yield range(done, done + more)
-        done += more
-        now = clock()
-        more = 2 * int((until - after - now) * done / (now - begun) / 2)

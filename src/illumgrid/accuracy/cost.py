@@ -52,8 +52,7 @@ def measure_pace(
         per_path.append((time.perf_counter() - begun) / (len(chosen) * paths))
         # Few nodes would cost as much as many; and the least of three, for in so short a time a stall counts for many.
         asking = timeit.repeat(partial(at_nodes, scene, number, spec, many), number=1, repeat=3)
-        filling = timeit.repeat(
-            partial(Nearest().fill, answer, Nodes(small, scene.fields[number], number)), number=1, repeat=3
-        )
+        fill = partial(Nearest().fill, answer, Nodes(small, scene.fields[number], number))
+        filling = timeit.repeat(fill, number=1, repeat=3)
         per_node.append(min(asking) / len(many) + min(filling) / int(np.prod(small.shape)))
     return Pace(float(np.mean(per_node)), float(np.mean(per_path)))

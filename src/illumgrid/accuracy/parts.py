@@ -11,31 +11,16 @@ from illumgrid.field.volume import Floats
 
 @dataclass(frozen=True)
 class Parts:
-    """The mean squared error of a grid in parts, each measured; all as squares relative to the mean irradiance.
+    """The mean squared error of a grid in parts, each measured; all as squares relative to the mean irradiance."""
 
-    Parameters
-    ----------
-    noise : float
-        Half the mean squared difference of two grids from independent seeds.
-    grid : float
-        What interpolation between nodes does, at points whose nodes all have light of their own: the mean product of
-        the two grids' errors, in which noise cancels. An estimate of 0 may come out slightly negative.
-    uncovered : float
-        The same at points that read a node without support.
-    bounces : float
-        Mean square of the light that more bounces add at the points themselves.
-    cross : float
-        What the sum of the four lacks of the total: the grid's error and the missing bounces are correlated.
-    uncertain : float
-        Standard error of `grid`, from the spread over the points.
-    """
-
-    noise: float
+    noise: float  # half the mean squared difference of two grids from independent seeds
+    # What interpolation between nodes does, at points whose nodes all have light of their own: the mean product of the
+    # two grids' errors, in which noise cancels. An estimate of 0 may come out slightly negative.
     grid: float
-    uncovered: float
-    bounces: float
-    cross: float
-    uncertain: float
+    uncovered: float  # the same at points that read a node without support
+    bounces: float  # mean square of the light that more bounces add at the points themselves
+    cross: float  # what the sum of the four lacks of the total: the grid's error and missing bounces are correlated
+    uncertain: float  # standard error of `grid`, from the spread over the points
 
     @property
     def total(self) -> float:
@@ -49,17 +34,10 @@ def missing(fewer: Reference, reference: Reference) -> Floats:
 
 
 def parts_of(one: Floats, other: Floats, covered: NDArray[np.bool_], fewer: Reference, reference: Reference) -> Parts:
-    """Split the error of a grid.
+    """Split the error of a grid, from what two that differ in their seeds hold, (n, 3), at the points of a reference.
 
-    Parameters
-    ----------
-    one, other : (n, 3) float64
-        What two grids that differ in nothing but their seeds hold at the points of the reference.
-    covered : (n,) bool
-        Points whose nodes all have light of their own.
-    fewer : Reference
-        The light at those points by the same paths, cut off after as many bounces as the grids had.
-    reference : Reference
+    `covered` (n,) marks points whose nodes all have light of their own; `fewer` is the light at the points by the same
+    paths, cut off after as many bounces as the grids had.
     """
     light, mean = fewer.light, reference.mean
     first, second = (one - light) / mean, (other - light) / mean

@@ -18,17 +18,12 @@ def other_paths(seed: int) -> int:
 
 
 def unseen_on_level_sets(scene: Scene, levels: int, points: int, seed: int) -> Queries:
-    """Points uniform by area on level sets that are drawn apart: one at random from each of `levels` equal steps.
-
-    Returns
-    -------
-    Queries
-        About `points` in all, on the trilinear level sets; every level set and field has as many.
-    """
+    """About `points` uniform by area on level sets of their own, one at random from each of `levels` equal steps."""
     random = np.random.default_rng((other_paths(seed), 1))
     rows = scene.levels((np.arange(levels) + random.random(levels)) / levels)
     each = max(1, round(points / (levels * len(scene.fields))))
-    found = join_queries(list(on_level_sets(scene, rows, other_paths(seed), points=each)))
+    none = Queries.at(scene, np.zeros((0, 3)))
+    found = join_queries([none, *on_level_sets(scene, rows, other_paths(seed), points=each)])
     return found[np.flatnonzero(found.normal.any(axis=1))]
 
 

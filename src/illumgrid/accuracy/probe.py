@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from illumgrid.accuracy.parts import Parts, missing, parts_of
 from illumgrid.accuracy.points import unseen_in_volume
@@ -17,94 +16,27 @@ from illumgrid.accuracy.reference import Reference, begin, converge, enough
 from illumgrid.bake import Bake, shifted_seed
 from illumgrid.errors import BadInput
 from illumgrid.field.scene import Scene
-from illumgrid.field.volume import Floats, world_to_index
-from illumgrid.field.volume import corners as corners_of
 from illumgrid.grid import GridSpec
-from illumgrid.samplers.direct import at_nodes, reachable
-from illumgrid.transport.samples import Queries, Samples, join_queries
+from illumgrid.samplers.direct import corners
 from illumgrid.transport.tracer import Tracer
 
 FEWEST_PATHS, MOST_PATHS = 4, 1 << 16  # from each node of a planned run
 BOUNCES = (0, 1, 2, 3, 4, 5, 6, 8, 10, 12, 16, 20, 24, 32, 48, 64, 96, 128)
 
 
-@dataclass(frozen=True, eq=False)
-class Corners:
-    """The nodes that a lookup at some points reads, in a grid that is never built.
-
-    Parameters
-    ----------
-    asked : Queries
-        One for each such node.
-    row : (n, 8) int64
-        Where in `asked` the nodes of each point are.
-    weight : (n, 8) float64
-        Trilinear weights.
-    nodes : int
-        How many nodes the whole grid would have to light.
-    """
-
-    asked: Queries
-    row: NDArray[np.int64]
-    weight: Floats
-    nodes: int
-
-    def read(self, samples: Samples) -> tuple[Floats, NDArray[np.bool_]]:
-        """Light (n, 3) at the points, and whether (n,) all of their nodes have light of their own.
-
-        A node without light counts as the mean of the others, as one that is filled from a neighbour does, nearly.
-        """
-        lit = (samples.paths > 0)[self.row] & (self.weight > 0)
-        weight = np.where(lit, self.weight, 0.0)
-        total = weight.sum(axis=1, keepdims=True)
-        light = np.einsum("nk,nkc->nc", weight, samples.mean[self.row].astype(float)) / np.where(total > 0, total, 1.0)
-        return light, np.asarray((lit | (self.weight == 0)).all(axis=1))
-
-
-def corners(scene: Scene, specs: Sequence[GridSpec], points: Queries) -> Corners:
-    """The nodes around the points of queries in grids with these lattices, one a field."""
-    row, weight = np.zeros((len(points), 8), np.int64), np.zeros((len(points), 8))
-    parts, first, nodes = [], 0, 0
-    for number, spec in enumerate(specs):
-        nodes += len(reachable(scene.fields[number], spec))
-        own = np.flatnonzero(points.target == number)
-        around, share = zip(*corners_of(spec, world_to_index(spec, points.point[own])))
-        flat = np.stack([np.ravel_multi_index(tuple(node.T), spec.shape) for node in around], axis=1)
-        unique, place = np.unique(flat, return_inverse=True)
-        row[own], weight[own] = first + place.reshape(flat.shape), np.stack(share, axis=1)
-        parts.append(at_nodes(scene, number, spec, unique))
-        first += len(unique)
-    return Corners(join_queries(parts), row, weight, nodes)
-
-
 @dataclass(frozen=True)
 class Measured:
-    """The error of grids of one size with one number of paths, in parts.
+    """The error of grids of one size with one number of paths, in parts."""
 
-    Parameters
-    ----------
-    grid : int
-        Nodes along the longest axis.
-    nodes : int
-        Nodes to light, in all.
-    parts : Parts
-    paths : int
-    falls : float
-        The noise (squared) falls as paths to this power; 1 for independent paths, more for well-spread ones.
-    """
-
-    grid: int
-    nodes: int
+    grid: int  # nodes along the longest axis
+    nodes: int  # to light, in all
     parts: Parts
     paths: int
-    falls: float = 1.0
+    falls: float = 1.0  # the noise (squared) falls as paths to this power; more than 1 for well-spread paths
 
     @property
     def floor(self) -> float:
-        """Mean squared error that no number of paths takes away, and one standard error more.
-
-        Where the light is rough, a few points carry the error, and a probe misses them more often than not.
-        """
+        """Mean squared error at any number of paths, and one standard error more: few points may carry it."""
         return float(max(0.0, self.parts.total - self.parts.noise) + self.parts.uncertain)
 
     def squared(self, paths: int) -> float:
@@ -123,23 +55,13 @@ class Measured:
 
 @dataclass(frozen=True, eq=False)
 class Probe:
-    """Points of a scene at which light is known, to measure grids against.
-
-    Parameters
-    ----------
-    scene : Scene
-    tracer : Tracer
-    seed : int
-    reference : Reference
-    few : Reference
-        Some of the points, with fewer paths: enough to see what bounces add, since both sides walk the same paths.
-    """
+    """Points of a scene at which light is known, to measure grids against."""
 
     scene: Scene
     tracer: Tracer
     seed: int
     reference: Reference
-    few: Reference
+    few: Reference  # some points with fewer paths: enough to see what bounces add, since both sides walk the same
 
     @classmethod
     def start(cls, scene: Scene, tracer: Tracer, points: int, error: float, seed: int, most: int = 1024) -> "Probe":

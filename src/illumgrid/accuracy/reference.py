@@ -22,17 +22,10 @@ class Reference:
     """Light at unseen points, with its own error: how far two halves from independent seeds differ.
 
     The error bars of the samples would not do: they are made to cover, and where light comes by few paths that is more.
-
-    Parameters
-    ----------
-    halves : (Bake, Bake)
-        One batch of points each, without holes; as many paths in both.
-    surface : str
-        The stand-in for the level sets that the light met: "levelset" (trilinear) or "mesh" (marching cubes).
     """
 
-    halves: tuple[Bake, Bake]
-    surface: str = "levelset"
+    halves: tuple[Bake, Bake]  # of one batch of points each, without holes; as many paths in both
+    surface: str = "levelset"  # that stands for the level sets: trilinear, or "mesh" (marching cubes)
 
     def __len__(self) -> int:
         return len(self.queries)
@@ -117,26 +110,13 @@ def converge(reference: Reference, tracer: Tracer, error: float, most: int = 1 <
 
 @dataclass(frozen=True)
 class Errors:
-    """How far a grid is from the reference, all relative to the mean irradiance.
+    """How far a grid is from the reference, all relative to the mean irradiance."""
 
-    Parameters
-    ----------
-    rmse : float
-        Root mean square over points and colours, the reference's own variance subtracted; at least a third of the
-        reference's own error, below which an error cannot be distinguished from none.
-    uncertain : float
-        Standard error of `rmse`, from the spread over the points.
-    median, p95 : float
-        Median and 95th percentile over points of the root mean square over colours.
-    bias : float
-        Mean difference; below 0 the grid is too dark.
-    """
-
-    rmse: float
-    uncertain: float
-    median: float
+    rmse: float  # root mean square, less the reference's own variance; a third of its own error is the least resolved
+    uncertain: float  # standard error of `rmse`, from the spread over the points
+    median: float  # as p95, over points of the root mean square over colours
     p95: float
-    bias: float
+    bias: float  # mean difference; below 0 the grid is too dark
 
 
 def look_up(grids: Sequence[IlluminationGrid], asked: Queries) -> Floats:
@@ -155,10 +135,5 @@ def errors(light: Floats, reference: Reference) -> Errors:
     each, own = np.sqrt(square), reference.error
     rmse = float(np.sqrt(max(own**2 / 9, square.mean() - own**2)))
     spread = float(square.std() / np.sqrt(len(square)))
-    return Errors(
-        rmse=rmse,
-        uncertain=spread / (2 * rmse) if rmse > 0 else 0.0,
-        median=float(np.median(each)),
-        p95=float(np.quantile(each, 0.95)),
-        bias=float(off.mean()),
-    )
+    median, p95 = np.quantile(each, (0.5, 0.95)).tolist()
+    return Errors(rmse, spread / (2 * rmse) if rmse > 0 else 0.0, median, p95, float(off.mean()))

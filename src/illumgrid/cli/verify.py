@@ -26,7 +26,8 @@ def verify(
     z is the mean difference over the queries, divided by its standard error and a derived bound on the error of the
     discretised surface; max |z| is the largest of a single query.
     """
-    from illumgrid.accuracy.verify import HEADER, check, line
+    from illumgrid.accuracy.verify import check
+    from illumgrid.transport.agreement import HEADER, line
 
     typer.echo(HEADER)
     rows = []

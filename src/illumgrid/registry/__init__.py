@@ -318,17 +318,21 @@ def interpolator(name: str, **options: Any) -> Interpolator:
     return cast(Interpolator, make("interpolator", name, options))
 
 
+def available(kind: str) -> Iterator[Any]:
+    """Every stage of a kind that can run here, with its default options."""
+    for found in entries():
+        if found.kind == kind and found.missing() is None:
+            try:
+                yield make(kind, found.name, {})
+            except (BadInput, ImportError):  # two packages claim the name, or something is missing after all
+                continue
+
+
 def backends() -> Iterator[tuple[str, Backend, Capabilities]]:
     """Every backend that can run here with its default options, once per surface: "numba:mesh", "embree"."""
-    for found in entries():
-        if found.kind != "backend" or found.missing() is not None:
-            continue
-        try:
-            stage = backend(found.name)
-        except (BadInput, ImportError):  # two packages claim the name, or something is missing after all
-            continue
+    for stage in available("backend"):
         for surface in capabilities(stage).variants:
-            chosen = replace(cast(Any, stage), surface=surface)
-            yield f"{found.name}:{surface}", chosen, capabilities(chosen)
+            chosen = replace(stage, surface=surface)
+            yield f"{stage.name}:{surface}", chosen, capabilities(chosen)
         if not capabilities(stage).variants:
-            yield found.name, stage, capabilities(stage)
+            yield stage.name, stage, capabilities(stage)

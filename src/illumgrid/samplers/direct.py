@@ -11,10 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from illumgrid.field.scene import Field, Scene
-from illumgrid.field.volume import index_to_world, interpolate, project, world_to_index
+from illumgrid.field.volume import Floats, index_to_world, interpolate, project, world_to_index
+from illumgrid.field.volume import corners as corners_of
 from illumgrid.grid import GridSpec
 from illumgrid.stages import Sampler, hookimpl
-from illumgrid.transport.samples import Queries
+from illumgrid.transport.samples import Queries, Samples, join_queries
 
 _BATCH = 1 << 14
 
@@ -89,6 +90,43 @@ class Direct:
             nodes = reachable(field, spec)
             for first in range(0, len(nodes), _BATCH):
                 yield at_nodes(scene, number, spec, nodes[first : first + _BATCH])
+
+
+@dataclass(frozen=True, eq=False)
+class Corners:
+    """The nodes that a lookup at some points reads, in a grid of `Direct` that is never built."""
+
+    asked: Queries  # one for each such node
+    row: NDArray[np.int64]  # (n, 8): where in `asked` the nodes of each point are
+    weight: Floats  # (n, 8): trilinear
+    nodes: int  # how many nodes the whole grid would have to light
+
+    def read(self, samples: Samples) -> tuple[Floats, NDArray[np.bool_]]:
+        """Light (n, 3) at the points, and whether (n,) all of their nodes have light of their own.
+
+        A node without light counts as the mean of the others, as one that is filled from a neighbour does, nearly.
+        """
+        lit = (samples.paths > 0)[self.row] & (self.weight > 0)
+        weight = np.where(lit, self.weight, 0.0)
+        total = weight.sum(axis=1, keepdims=True)
+        light = np.einsum("nk,nkc->nc", weight, samples.mean[self.row].astype(float)) / np.where(total > 0, total, 1.0)
+        return light, np.asarray((lit | (self.weight == 0)).all(axis=1))
+
+
+def corners(scene: Scene, specs: Sequence[GridSpec], points: Queries) -> Corners:
+    """The nodes around the points of queries in grids with these lattices, one a field."""
+    row, weight = np.zeros((len(points), 8), np.int64), np.zeros((len(points), 8))
+    parts, first, nodes = [], 0, 0
+    for number, spec in enumerate(specs):
+        nodes += len(reachable(scene.fields[number], spec))
+        own = np.flatnonzero(points.target == number)
+        around, share = zip(*corners_of(spec, world_to_index(spec, points.point[own])))
+        flat = np.stack([np.ravel_multi_index(tuple(node.T), spec.shape) for node in around], axis=1)
+        unique, place = np.unique(flat, return_inverse=True)
+        row[own], weight[own] = first + place.reshape(flat.shape), np.stack(share, axis=1)
+        parts.append(at_nodes(scene, number, spec, unique))
+        first += len(unique)
+    return Corners(join_queries(parts), row, weight, nodes)
 
 
 @hookimpl

@@ -29,12 +29,10 @@ DEFAULT, PREDICTED = 0.3, 0.15  # for `run`'s default, at most; if that is too l
 
 GOAL, FEWEST = 0.01, 500  # own error of a reference, for which points are dropped where light is rough, to so many
 LONGEST = 1e7  # seconds of a budget: four months; counts of paths in proportion to it stay whole numbers
-PARTS_PATHS, PARTS_REFERENCE = (16, 64, 256), 256
-PARTS_POINTS = (512, 4096)
+PARTS_PATHS, PARTS_REFERENCE, PARTS_POINTS = (16, 64, 256), 256, (512, 4096)
 
+# From a scene, its tracer, an exposure, bounces, a seed and paths for a converged picture: what compares grids with it.
 Studio = Callable[[Scene, Tracer, float, int, int, float], Flip | None]
-"""From a scene, its tracer, an exposure, bounces, a seed and about how many paths a converged picture
-may take: what compares grids with that picture, or None if those are too few."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,27 +48,8 @@ class Report:
     seconds: float  # that all of it took, from warm kernels on
 
 
-@dataclass(frozen=True)
-class Budget:
-    """A time to use, from now on."""
-
-    seconds: float
-    begun: float
-
-    def spent(self) -> float:
-        """Seconds since the beginning."""
-        return time.perf_counter() - self.begun
-
-    def left(self, share: float = 1.0) -> float:
-        """Seconds until a share of the budget is spent."""
-        return share * self.seconds - self.spent()
-
-
 def sizes(scene: Scene) -> list[int]:
-    """Grids that take part: a quarter, half, once and 1.6 times the nodes that `run` has by default.
-
-    Nodes on voxels are the worst place to ask on noisy data (docs/stability.md).
-    """
+    """Grids that take part: a quarter, half, once and 1.6 times the nodes that `run` has by default."""
     default = max(max(spec.shape) for spec in specs_over(scene))
     return sorted({max(4, round(default * share)) for share in (0.25, 0.5, 1.0, 1.6)})
 
@@ -83,25 +62,10 @@ def bench(
     default: tuple[int | None, int] = (None, PATHS),
     studio: Studio | None = None,
 ) -> Report:
-    """Race all contestants on a scene.
+    """Race all contestants on a scene for `budget` seconds, from warm kernels on.
 
-    Parameters
-    ----------
-    scene : Scene
-    budget : float
-        Seconds, from warm kernels on.
-    seed : int
-    progress : callable, optional
-        Called with (what, done, total).
-    default : (int or None, int), optional
-        Nodes and paths that are marked as the default of `run`; by default those of `illumgrid.run`.
-    studio : callable, optional
-        What takes pictures, for the difference that an eye would see.
-
-    Raises
-    ------
-    BadInput
-        On a budget that is not positive, or a scene without surface or light.
+    `default` are the nodes and paths that are marked as the default of `run`; `studio` takes pictures, for the
+    difference that an eye would see. A budget that is not positive or a scene without surface or light raises BadInput.
     """
     if not 0 < budget <= LONGEST:
         raise BadInput(
@@ -109,41 +73,41 @@ def bench(
         )
     auto = prepare(registry.backend("auto"), scene)
     light_left_out(scene, auto, 0)  # compiles
-    clock = Budget(budget, time.perf_counter())
+    begun, racing, before_parts = time.perf_counter(), (1 - 0.7 * REFERENCES - PARTS) * budget, (1 - PARTS) * budget
+
+    def report() -> float:
+        spent = time.perf_counter() - begun
+        progress("race", min(int(spent), int(budget)), int(budget))
+        return spent
+
     asked = _unseen(scene, budget, seed)
-    if not len(asked):
-        raise BadInput("no isosurface of the range can be lit; expected a range within the data")
     entrants, notes = tracers(scene, asked, budget)
-    probe = Probe.start(scene, auto, 256, 0.02, seed, 64)
-    bounces = probe.bounces_for(0.002)
+    bounces = Probe.start(scene, auto, 256, 0.02, seed, 64).bounces_for(0.002)
     references, pace = _references(scene, entrants, asked, budget, seed, notes)
     by_surface = {surface: _tracer_of(entrants, surface) for surface in references}
     _sharpen(references, by_surface, dict.fromkeys(references, 4 * GOAL), 0.3 * REFERENCES * budget)
-    main = next(iter(references))
-    flip = _camera(studio, scene, by_surface[main], references[main], seed, PICTURE * budget / pace)
-    race = Race(
-        scene, references, methods([m for m in entrants if m.surface in references]), sizes(scene), bounces, seed
-    )
+    main, reference = next(iter(references.items()))
+    albedo = np.array([field.material.albedo for field in scene.fields])[reference.queries.target]
+    exposure = tone.automatic_exposure(reference.light, albedo)
+    paths = PICTURE * budget / pace
+    flip = studio(scene, by_surface[main], exposure, reference.bounces, seed, paths) if studio else None
+    able = methods([method for method in entrants if method.surface in references])
+    race = Race(scene, references, able, sizes(scene), bounces, seed)
     notes += _show_default(race, *default, budget)
-
-    def report() -> None:
-        progress("race", min(int(clock.spent()), int(budget)), int(budget))
-
-    racing = 1 - 0.7 * REFERENCES - PARTS
-    while contestant := race.next(clock.left(racing)):
+    while contestant := race.next(racing - report()):
         race.advance(contestant)
-        report()
     if not race.points:
         raise BadInput("no contestant could finish; " + "; ".join(notes + race.notes))
-    race.repeat(clock.begun + racing * budget, report, flip)
-    _sharpen(
-        references, by_surface, {s: e / 5 for s, e in _least(race.points, references).items()}, clock.left(1 - PARTS)
-    )
-    race.repeat(clock.begun + (1 - PARTS) * budget, report, flip)  # what the reference did not need: missing seeds
-    parts = measure_parts(scene, auto, sizes(scene), bounces, seed, clock.left(), pace)
-    best = tuple(front(race.points, references))
-    notes += [*race.notes, *_remarks(best, references)]
-    return Report(tuple(race.points), best, references, tuple(parts), bounces, tuple(notes), clock.spent())
+    race.repeat(begun + racing, report, flip)
+    best = {
+        s: min((p.rmse(r) for p in race.points if p.method.surface == s), default=1.0) for s, r in references.items()
+    }
+    _sharpen(references, by_surface, {surface: error / 5 for surface, error in best.items()}, before_parts - report())
+    race.repeat(begun + before_parts, report, flip)  # what the references did not need goes into missing seeds
+    parts = measure_parts(scene, auto, sizes(scene), bounces, seed, budget - report(), pace)
+    shown = tuple(front(race.points, references))
+    notes += [*race.notes, *_remarks(shown, references)]
+    return Report(tuple(race.points), shown, references, tuple(parts), bounces, tuple(notes), report())
 
 
 def _unseen(scene: Scene, budget: float, seed: int) -> Queries:
@@ -153,7 +117,10 @@ def _unseen(scene: Scene, budget: float, seed: int) -> Queries:
         unseen_on_level_sets(scene, 1, points, seed)
         one = time.perf_counter() - begun
     levels = int(np.clip(0.05 * budget / one, 8, 48))
-    return unseen_on_level_sets(scene, levels, int(np.clip(100 * levels, 1200, 4000)), seed)
+    asked = unseen_on_level_sets(scene, levels, int(np.clip(100 * levels, 1200, 4000)), seed)
+    if not len(asked):
+        raise BadInput("no isosurface of the range can be lit; expected a range within the data")
+    return asked
 
 
 def _tracer_of(entrants: Sequence[Method], surface: str) -> Tracer:
@@ -198,39 +165,18 @@ def _thinned(reference: Reference, surface: str, spent: float, left: float, seed
 def _sharpen(
     references: dict[str, Reference], by_surface: dict[str, Tracer], error: dict[str, float], left: float
 ) -> None:
-    """Walk more paths in place until the references' own errors are small enough or the time is over.
-
-    The first, which judges most, comes last: it has what the others leave.
-    """
+    """Walk more paths until the own errors are small enough or the time is over; the main reference comes last."""
     end = time.perf_counter() + left
     for rest, (surface, reference) in zip(range(len(references), 0, -1), reversed(list(references.items()))):
         spent, begun = 0.0, time.perf_counter()
         until = begun + (end - begun) / rest
-        while (
-            reference.error > error[surface] and time.perf_counter() + 2 * spent < until and reference.paths < 1 << 15
-        ):
+        while reference.error > error[surface] and reference.paths < 1 << 15:
             step = time.perf_counter()
+            if step + 2 * spent >= until:
+                break
             reference = converge(reference, by_surface[surface], 0.0, 2 * reference.paths)
             spent = time.perf_counter() - step
         references[surface] = reference
-
-
-def _least(points: Sequence[Point], references: dict[str, Reference]) -> dict[str, float]:
-    """Least error on each surface."""
-    return {
-        surface: min((p.rmse(reference) for p in points if p.method.surface == surface), default=1.0)
-        for surface, reference in references.items()
-    }
-
-
-def _camera(
-    studio: Studio | None, scene: Scene, tracer: Tracer, reference: Reference, seed: int, paths: float
-) -> Flip | None:
-    if studio is None:
-        return None
-    albedo = np.array([field.material.albedo for field in scene.fields])[reference.queries.target]
-    exposure = tone.automatic_exposure(reference.light, albedo)
-    return studio(scene, tracer, exposure, reference.bounces, seed, paths)
 
 
 def _show_default(race: Race, grid: int | None, paths: int, budget: float) -> list[str]:

@@ -1,7 +1,7 @@
 """What can be compared: every sampler with every backend and every interpolator that is available here."""
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -39,21 +39,8 @@ class Method:
         return f"{sampler}, {self.backend.name}{surface}, {interpolator.name}"
 
 
-def _stages(kind: str) -> Iterator[Any]:
-    """Every stage of a kind with its default options; what is not available here is passed over."""
-    for entry in registry.entries():
-        if entry.kind == kind and entry.missing() is None:
-            try:
-                yield registry.make(kind, entry.name, {})
-            except (BadInput, ImportError):  # two packages claim the name, or something is missing after all
-                continue
-
-
 def tracers(scene: Scene, asked: Queries, budget: float) -> tuple[list[Method], list[str]]:
-    """Backends on each of their surfaces, as methods that lack a sampler and are warm; and why others are left out.
-
-    The fastest one is never too slow.
-    """
+    """Backends on each of their surfaces, as warm methods that lack a sampler, and why others are left out."""
     found, notes = [], []
     few = asked[: min(64, len(asked))]
     few = few[np.flatnonzero((few.level == few.level[0]).all(axis=1))]  # a mesh is made for each level set
@@ -81,8 +68,8 @@ def tracers(scene: Scene, asked: Queries, budget: float) -> tuple[list[Method], 
 def methods(tracers: Sequence[Method]) -> list[Method]:
     """Every sampler and interpolator with each of the `tracers`, with the fewest level sets each."""
     found = []
-    interpolators = tuple(_stages("interpolator"))
-    for sampler in _stages("sampler"):
+    interpolators = tuple(registry.available("interpolator"))
+    for sampler in registry.available("sampler"):
         for tracer in tracers:
             method = replace(tracer, sampler=sampler, interpolators=interpolators)
             if hasattr(sampler, "count"):

@@ -2,14 +2,13 @@
 
 import time
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from illumgrid.accuracy.chart.methods import COUNTS, Method
-from illumgrid.accuracy.probe import corners
 from illumgrid.accuracy.reference import Reference, errors, look_up
 from illumgrid.bake import Bake, shifted_seed
 from illumgrid.errors import BadInput
@@ -17,6 +16,7 @@ from illumgrid.field.lattice import specs_over
 from illumgrid.field.scene import Scene
 from illumgrid.field.volume import Floats
 from illumgrid.grid import GridSpec, IlluminationGrid, Nodes
+from illumgrid.samplers.direct import corners
 from illumgrid.stages import Interpolator
 from illumgrid.transport.samples import Queries, join_samples
 from illumgrid.transport.stages import fill_nodes
@@ -24,8 +24,7 @@ from illumgrid.transport.stages import fill_nodes
 STEPS = (8, 32, 128, 512, 2048)  # paths; `run`'s default is one of them
 SEEDS = 3
 
-Flip = Callable[[list[IlluminationGrid]], float]
-"""How different a picture of grids looks from the converged one."""
+Flip = Callable[[list[IlluminationGrid]], float]  # how different a picture of grids looks from the converged one
 
 
 @dataclass(eq=False)
@@ -46,11 +45,6 @@ class Point:
     flip: float | None = None  # of a picture at an unseen isovalue
     default: bool = False  # whether it is what `run` does when nothing is asked for
     built: bool = True  # or only the nodes around the points were lit, and `seconds` are predicted
-
-    @property
-    def label(self) -> str:
-        """Name of the contestant."""
-        return self.method.label(self.interpolator)
 
     @property
     def time(self) -> float:
@@ -115,11 +109,8 @@ def front(points: Iterable[Point], references: dict[str, Reference]) -> list[Poi
 
 
 def slowdown(point: Point, error: dict[Point, float]) -> float:
-    """Relative to the front: time ratio at equal error, or squared-error ratio at equal time, whichever is larger.
-
-    Noise halves with four times the paths, hence the square.
-    """
-    own = error[point]
+    """Relative to the front: time ratio at equal error, or squared-error ratio at equal time, whichever is larger."""
+    own = error[point]  # squared, for noise halves with four times the paths
     least = min(e for p, e in error.items() if p.time <= 1.05 * point.time)
     quick = min(p.time for p, e in error.items() if e <= 1.05 * own)
     return float(max(1.0, (own / least) ** 2, point.time / quick))
@@ -127,52 +118,45 @@ def slowdown(point: Point, error: dict[Point, float]) -> float:
 
 @dataclass(eq=False)
 class Contestant:
-    """A method on one size of grid: what its next step would cost, and the points by which it is ranked.
-
-    Those are its own last ones, or before its first step those of the contestant that it came from, with a factor.
-    """
+    """A method on one size of grid."""
 
     run: Run
     interpolators: tuple[Interpolator, ...]
     step: int = 0
-    cost: float = 0.0
-    ranked_by: tuple[Point, ...] = ()
-    factor: float = 1.0
+    cost: float = 0.0  # of the next step, predicted
+    ranked_by: tuple[Point, ...] = ()  # its own last points, or at first those of the contestant that it came from,
+    factor: float = 1.0  # ... and what their slowdown is multiplied by
     converged: bool = False
     first: bool = True
 
 
+@dataclass(eq=False)
 class Race:
-    """Methods on grids, advanced one step at a time.
+    """Methods on grids of `sizes`, coarse to fine, advanced one step at a time; references by surface judge them."""
 
-    Parameters
-    ----------
-    scene : Scene
-    references : dict of Reference
-        By surface.
-    methods : list of Method
-    sizes : list of int
-        Grids, from coarse to fine.
-    bounces, seed : int
-    """
+    scene: Scene
+    references: dict[str, Reference]
+    methods: list[Method]
+    sizes: list[int]
+    bounces: int
+    seed: int
+    points: list[Point] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
 
-    def __init__(
-        self, scene: Scene, references: dict[str, Reference], methods: list[Method], sizes: list[int], bounces: int,
-        seed: int,
-    ) -> None:  # fmt: skip
-        self.scene, self.references, self.sizes, self.bounces, self.seed = scene, references, sizes, bounces, seed
+    def __post_init__(self) -> None:
         # Until it has run, a slow backend counts as off the front by its slowness. The first contestant shows what the
         # others will cost: one that builds no meshes.
         self.contestants = [
-            Contestant(Run(scene, method, sizes[0], bounces, seed), method.interpolators, factor=method.slow)
-            for method in sorted(methods, key=lambda m: (m.surface != "levelset", m.slow))
+            Contestant(self._run(method, self.sizes[0]), method.interpolators, factor=method.slow)
+            for method in sorted(self.methods, key=lambda m: (m.surface != "levelset", m.slow))
         ]
-        self.points: list[Point] = []
-        self.notes: list[str] = []
+
+    def _run(self, method: Method, grid: int | None, again: int = 0) -> Run:
+        return Run(self.scene, method, grid, self.bounces, shifted_seed(self.seed, again))
 
     def show_default(self, method: Method, nearest: Interpolator, grid: int | None, paths: int) -> None:
         """Chart what `run` does when nothing is asked for, before all others; its contestant goes on from there."""
-        run = Run(self.scene, method, grid, self.bounces, self.seed)
+        run = self._run(method, grid)
         run.go_on(paths)
         point, _ = self._point(run, nearest)
         point.default = True
@@ -200,7 +184,8 @@ class Race:
         """Take the next step of a contestant, and fill the grid by every interpolator."""
         run, paths = contestant.run, STEPS[contestant.step]
         begun = time.perf_counter()
-        same = [p for p in self.points if p.method is run.method and (p.grid, p.paths) == (run.grid, paths)]
+        own = [p for p in self.points if p.method is run.method and p.grid == run.grid]
+        same = [p for p in own if p.paths == paths]
         known = {p.interpolator: p for p in same if p.built}
         try:
             run.go_on(paths)
@@ -213,12 +198,9 @@ class Race:
         for other in self.contestants:
             if other.cost == 0.0:  # nobody has run before this one
                 other.cost = spent * other.run.method.slow / run.method.slow
-        before = [
-            p for p in self.points if p.method is run.method and (p.grid, p.paths) == (run.grid, self._last(paths))
-        ]
         self.points = [p for p in self.points if p.built or p not in same]  # built is better than predicted
         self.points += [p for p in new if p.interpolator not in known]
-        self._rank(contestant, new, before)
+        self._rank(contestant, new, [p for p in own if p.paths == STEPS[contestant.step - 1]])
         contestant.step += 1
         if contestant.step < len(STEPS):
             filling = sum(p.filling for p in new if p.interpolator in contestant.interpolators)
@@ -226,10 +208,6 @@ class Race:
         if contestant.first:
             contestant.first = False
             self._unlock(contestant, spent)
-
-    @staticmethod
-    def _last(paths: int) -> int:
-        return STEPS[STEPS.index(paths) - 1]
 
     def _rank(self, contestant: Contestant, new: list[Point], before: list[Point]) -> None:
         """Compare new points with the front: drop interpolators that hold the others up, and see what has converged."""
@@ -246,27 +224,25 @@ class Race:
     def _unlock(self, contestant: Contestant, spent: float) -> None:
         """What comes after a first step: the next finer grid, and on the coarsest more level sets."""
         run = contestant.run
+
+        def add(method: Method, grid: int, cost: float, factor: float) -> None:
+            ahead, ranked_by = self._run(method, grid), contestant.ranked_by
+            self.contestants.append(Contestant(ahead, contestant.interpolators, 0, cost, ranked_by, factor))
+
         finer = [size for size in self.sizes if size > run.longest]
         if finer and not any(c.run.method is run.method and c.run.grid == finer[0] for c in self.contestants):
             # Twice the nodes may halve the error, for which noise would need four times the paths: so much sooner.
             more = finer[0] / run.longest
-            ahead = Run(self.scene, run.method, finer[0], self.bounces, self.seed)
-            factor, ranked_by = 1 / more**2, contestant.ranked_by
-            self.contestants.append(Contestant(ahead, contestant.interpolators, 0, spent * more**3, ranked_by, factor))
+            add(run.method, finer[0], spent * more**3, 1 / more**2)
         if run.method.denser and run.grid == self.sizes[0]:
-            ahead = Run(self.scene, run.method.denser, run.grid, self.bounces, self.seed)
-            cost = spent * COUNTS[1] / COUNTS[0]
-            self.contestants.append(Contestant(ahead, contestant.interpolators, 0, cost, contestant.ranked_by))
+            add(run.method.denser, self.sizes[0], spent * COUNTS[1] / COUNTS[0], 1.0)
 
     def _point(self, run: Run, interpolator: Interpolator) -> tuple[Point, list[IlluminationGrid]]:
         grids, seconds = run.fill(interpolator)
-        asked = self.references[run.method.surface].queries
-        queries = sum(len(a) for a in run.bake.answers)
-        read = covered(grids, asked)
-        point = Point(run.method, interpolator, run.grid, run.bake.paths, queries, read, run.longest, [seconds])
-        point.filling = seconds - run.asking - run.tracing
-        point.light.append(look_up(grids, asked))
-        return point, grids
+        asked, queries = self.references[run.method.surface].queries, sum(map(len, run.bake.answers))
+        read, filling, light = covered(grids, asked), seconds - run.asking - run.tracing, [look_up(grids, asked)]
+        point = Point(run.method, interpolator, run.grid, run.bake.paths, queries, read, run.longest)
+        return replace(point, seconds=[seconds], filling=filling, light=light), grids
 
     def _standing(self) -> dict[Point, float]:
         """Errors of all points."""
@@ -303,7 +279,7 @@ class Race:
         same = [p for p in self.points if p.method is most.method and p.grid == most.grid and p.built]
         return [p for p in same if p.paths <= most.paths and p.interpolator in fillers]
 
-    def repeat(self, deadline: float, report: Callable[[], None], flip: Flip | None = None) -> None:
+    def repeat(self, deadline: float, report: Callable[[], object], flip: Flip | None = None) -> None:
         """Run the front's points with other seeds, until every one of them has enough."""
         while missing := self.missing_seeds():
             most = min(missing, key=lambda p: missing[p])
@@ -311,8 +287,7 @@ class Race:
                 return
             same = self._together(front(self.points, self.references), most)
             again = max(len(p.seconds) for p in same if p.paths == most.paths)
-            run = Run(self.scene, most.method, most.grid, self.bounces, shifted_seed(self.seed, again))
-            before = resident(reset=True)
+            run, before = self._run(most.method, most.grid, again), resident(reset=True)
             for point in sorted(same, key=lambda p: p.paths):
                 run.go_on(point.paths)
                 if len(point.seconds) == again:

@@ -1,5 +1,8 @@
-"""What a race showed: plain records, and which setting to use."""
+"""What `illumgrid bench` found, as records, files and text: which setting to use."""
 
+import csv
+import io
+import json
 import os
 import platform
 from collections.abc import Sequence
@@ -64,7 +67,7 @@ def record(point: Point, references: dict[str, Reference], on_front: bool) -> Re
     each = [errors(light, references[method.surface]) for light in point.light]
     several = len(each) > 1
     return {
-        "contestant": point.label,
+        "contestant": method.label(filler),
         **{kind: stage.name for kind, stage in stages.items()},
         "options": {kind: asdict(stage) for kind, stage in stages.items()},
         "surface": method.surface,
@@ -134,3 +137,55 @@ def dominant(record: Record, parts: Sequence[Record]) -> str:
         parts, key=lambda p: (abs(np.log(p["nodes"] / record["grid"])), abs(np.log(p["paths"] / record["paths"])))
     )
     return REMEDIES[max(REMEDIES, key=lambda name: near[name])]
+
+
+def files(report: Report, name: str, scene: Scene) -> tuple[dict[str, bytes], str]:
+    """Content of every file, and the text for the terminal."""
+    from illumgrid.show import chart
+
+    made = described(report, name, scene)
+    records, points = made["points"], max(about["points"] for about in made["truth"].values())
+    title = f"{name}: {report.bounces} bounces, reference at {points} points"
+    figure = chart.draw(records, made["parts"], title)
+    content = {
+        "bench.json": json.dumps(made, indent=1).encode() + b"\n",
+        "bench.csv": _csv(records),
+        "chart.png": chart.image(figure, "png"),
+        "chart.svg": chart.image(figure, "svg"),
+    }
+    notes = [f"note: {note}" for note in report.notes]
+    return content, "\n".join([table(records), *notes, f"{name}: " + "; ".join(made["advice"])])
+
+
+def _csv(records: Sequence[Record]) -> bytes:
+    text = io.StringIO()
+    columns = [key for key in records[0] if key != "options"]
+    writer = csv.DictWriter(text, columns, extrasaction="ignore", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(records)
+    return text.getvalue().encode()
+
+
+def table(records: Sequence[Record]) -> str:
+    """The front, what `run` does by default, and the best of every other contestant, as text."""
+    best = sorted((r for r in records if r["front"]), key=lambda r: r["seconds"])
+    default = [r for r in records if r["default"] and not r["front"]]
+    seen, others = {r["contestant"] for r in best}, []
+    for r in sorted(records, key=lambda r: r["rmse"]):
+        if r["contestant"] not in seen:
+            seen.add(r["contestant"])
+            others.append(r)
+    wide = max(len(r["contestant"]) for r in records)
+    heads = [f"{head:>8}" for head in ("seconds", "error", "+-", "median", "95 %", "bias", "FLIP", "MB")]
+    lines = [f"{'contestant':{wide}} {'grid':>5} {'paths':>6} {' '.join(heads)}"]
+    for name, part in (("the front:", best), ("run's default:", default), ("the best of the others:", others)):
+        lines += [name] * bool(part)
+        for r in part:
+            spread = "" if r["rmse_spread"] is None else f"{r['rmse_spread']:.2%}"
+            seconds = f"{'' if r['built'] else '~'}{r['seconds']:.2f}"
+            setting = f"{r['contestant']:{wide}} {r['grid']:5} {r['paths']:6} {seconds:>8}"
+            off = f"{r['rmse']:8.2%} {spread:>8} {r['median']:8.2%} {r['p95']:8.2%} {r['bias']:+8.2%}"
+            flip = "" if r["flip"] is None else f"{r['flip']:.4f}"
+            memory = "" if r["memory_mb"] is None else f"{r['memory_mb']:.0f}"
+            lines.append(f"{setting} {off} {flip:>8} {memory:>8}".rstrip())
+    return "\n".join(lines)
