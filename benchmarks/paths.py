@@ -20,7 +20,7 @@ import numpy as np
 from rays import gaussians
 
 from illumgrid.accuracy.verify import contenders
-from illumgrid.backends import meshes
+from illumgrid.backends.mesh import meshes
 from illumgrid.field.scene import Scene
 from illumgrid.stages import on_level_sets
 

@@ -27,8 +27,9 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from illumgrid import Queries, Scene, Volume, isosurface
-from illumgrid.backends import bvh
-from illumgrid.backends.kernels import NOWHERE, nearest_hit
+from illumgrid.backends.kernels import nearest_hit
+from illumgrid.backends.mesh import bvh
+from illumgrid.constants import NOWHERE
 from illumgrid.field.levelset import marchable
 from illumgrid.transport.samples import in_frame
 

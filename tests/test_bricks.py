@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from illumgrid.field.bricks import BRICK, RANKS, REACH, lay_bricks
+from illumgrid.constants import BRICK, REACH
+from illumgrid.field.bricks import RANKS, lay_bricks
 
 SHAPES = [(2, 2, 2), (5, 5, 5), (6, 9, 4), (37, 22, 81)]
 

@@ -9,7 +9,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 from skimage.measure import marching_cubes
 
-from illumgrid.backends import bvh
+from illumgrid.backends.mesh import bvh
 
 RAYS = int(os.environ.get("BVH_RAYS", 400_000))  # into each of ten sealed cavities
 BATCH = 1_000_000

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 import naive
-from illumgrid.backends import kernels
+from illumgrid import constants
+from illumgrid.backends import kernels, march
 from illumgrid.backends.numba_ import Numba
 from illumgrid.backends.reference import Reference
 from illumgrid.field.levelset import marchable, turned_levels
@@ -50,7 +51,7 @@ def test_the_first_root_of_a_cubic_is_that_of_numpy():
         expected, close = first_of(q, end)
         if close:
             continue
-        t = kernels.first_root(*q, end)
+        t = march.first_root(*q, end)
         assert t == pytest.approx(expected, abs=1e-9, rel=1e-9)
         found += expected < math.inf
         checked += 1
@@ -67,7 +68,7 @@ def test_the_first_root_of_what_is_no_cubic():
         ((-0.24, 1, -1, 0), 1, 0.4),
         ((-2, 3, -1, 0), 3, 1),
     ):
-        t = kernels.first_root(*(np.float64(c) for c in q), np.float64(end))
+        t = march.first_root(*(np.float64(c) for c in q), np.float64(end))
         assert t == pytest.approx(expected, abs=1e-13)
 
 
@@ -80,7 +81,7 @@ def test_a_near_tangent_ray_hits_or_misses_as_the_sign_at_the_top_says(gap):
         falling = np.polynomial.Polynomial([-top, 1]) ** 2 * np.polynomial.Polynomial([slope - bend * top, bend])
         for sign in (1, -1):
             q = (np.polynomial.Polynomial([sign * gap**2]) - falling).coef
-            t = kernels.first_root(*q, np.float64(1))
+            t = march.first_root(*q, np.float64(1))
             if gap**2 < 1e-15:  # lost in rounding: either answer, but at the right place
                 assert t == math.inf or t == pytest.approx(top, abs=1e-6)
             elif sign > 0:
@@ -98,7 +99,7 @@ def test_the_next_root_is_the_first_of_the_quadratic_that_is_left():
         end = rng.uniform(0.2, 3)
         expected, close = first_of(q, end)
         if not close:
-            assert kernels.next_root(*q, end) == pytest.approx(expected, abs=1e-9, rel=1e-9)
+            assert march.next_root(*q, end) == pytest.approx(expected, abs=1e-9, rel=1e-9)
             found += expected < math.inf
             checked += 1
     assert min(checked, 8 * found) > 2000
@@ -118,7 +119,7 @@ def test_the_next_root_of_what_is_no_cubic():
         ((-1, 2.1, -1), 0.72984378812835),
         ((-1, 1.9, -1), math.inf),
     ):
-        t = kernels.next_root(*(np.float64(c) for c in q), np.float64(1))
+        t = march.next_root(*(np.float64(c) for c in q), np.float64(1))
         assert t == pytest.approx(expected, abs=1e-12)
 
 
@@ -127,8 +128,8 @@ def test_on_a_plane_of_voxels_the_direction_chooses_the_cell():
         (2.5, 1.0, 2), (2.5, -1.0, 2), (2.0, 1.0, 2), (2.0, -1.0, 1), (2.0, 0.0, 2), (5.0, 0.0, 4), (5.0, -1.0, 4),
         (5.0, 1.0, 5), (0.0, -1.0, -1), (0.0, 1.0, 0), (0.0, 0.0, 0),
     ):  # fmt: skip
-        assert kernels.first_cell(np.float64(u), np.float64(d), 5) == expected
-    assert [kernels.snap(np.float64(u)) for u in (3 + 5e-8, 3 + 2e-7)] == [3, 3 + 2e-7]
+        assert march.first_cell(np.float64(u), np.float64(d), 5) == expected
+    assert [march.snap(np.float64(u)) for u in (3 + 5e-8, 3 + 2e-7)] == [3, 3 + 2e-7]
 
 
 # Values, normals, directions.
@@ -147,11 +148,11 @@ def test_normals_and_solids_are_those_of_the_volume(inside):
     level = turned_levels(scene, np.array([4.5]))[0]
     solid = scene.fields[0].upward * (interpolate(volume, index) - 4.5) >= 0
     for u, normal, within in zip(index, expected, solid):
-        np.testing.assert_allclose(kernels.gradient_normal(fields, 0, *u), normal, atol=1e-6)
-        assert kernels.in_solid(fields, 0, level, tuple(u * volume.spacing), tuple(normal)) == within
+        np.testing.assert_allclose(march.gradient_normal(fields, 0, *u), normal, atol=1e-6)
+        assert march.in_solid(fields, 0, level, tuple(u * volume.spacing), tuple(normal)) == within
     assert (~expected.any(axis=1)).any()
     assert not any(
-        kernels.in_solid(fields, 0, level, tuple(np.array(u) * volume.spacing), (0.0, 0.0, 1.0))
+        march.in_solid(fields, 0, level, tuple(np.array(u) * volume.spacing), (0.0, 0.0, 1.0))
         for u in ([-0.1, 1, 1], [1, 4.1, 1], [1, 1, 2.1])
     )
 
@@ -200,28 +201,28 @@ def test_camera_rays_meet_what_the_loops_say(inside):
     for i in range(100):
         hit = naive.first_hit(scene, levels, origin[i], direction[i])
         if hit is None:
-            assert (what[i], t[i], field[i]) == (kernels.MISS, math.inf, -1)
+            assert (what[i], t[i], field[i]) == (constants.MISS, math.inf, -1)
             continue
         assert field[i] == hit.field
         assert t[i] == pytest.approx(hit.t, abs=1e-9)
-        expected = kernels.BURIED if hit.normal is None else kernels.CAP if hit.cap else kernels.SURFACE
+        expected = constants.BURIED if hit.normal is None else constants.CAP if hit.cap else constants.SURFACE
         assert what[i] == expected
         np.testing.assert_allclose(normal[i], [0, 0, 0] if hit.normal is None else hit.normal, atol=1e-6)
-    assert set(what) == {kernels.MISS, kernels.SURFACE, kernels.CAP, kernels.BURIED}
+    assert set(what) == {constants.MISS, constants.SURFACE, constants.CAP, constants.BURIED}
 
 
 def test_rays_along_the_faces_and_edges_of_the_box():
     scene = Scene.sky(linear((1, 0, 0), (6, 6, 6)), range=(0.5, 4.5))  # solid where x >= 2.25
     x, y, z = np.eye(3)
     rays = [
-        ([-1, 0, 2.5], x, 3.25, kernels.SURFACE, -x),  # in a face
-        ([-1, 5, 5], x, 3.25, kernels.SURFACE, -x),  # along the last edge
-        ([9, 0, 5], -x, 4, kernels.CAP, x),
-        ([5, -2, 1.5], y, 2, kernels.CAP, -y),
-        ([3, 3, 8], -z, 3, kernels.CAP, z),
-        ([-1, 5.001, 2], x, math.inf, kernels.MISS, 0 * x),  # beside
-        ([-1, -1, 0], (x + y) / math.sqrt(2), 3.25 * math.sqrt(2), kernels.SURFACE, -x),  # the diagonal of a face
-        ([4, 2, 2], x, 0, kernels.BURIED, 0 * x),
+        ([-1, 0, 2.5], x, 3.25, constants.SURFACE, -x),  # in a face
+        ([-1, 5, 5], x, 3.25, constants.SURFACE, -x),  # along the last edge
+        ([9, 0, 5], -x, 4, constants.CAP, x),
+        ([5, -2, 1.5], y, 2, constants.CAP, -y),
+        ([3, 3, 8], -z, 3, constants.CAP, z),
+        ([-1, 5.001, 2], x, math.inf, constants.MISS, 0 * x),  # beside
+        ([-1, -1, 0], (x + y) / math.sqrt(2), 3.25 * math.sqrt(2), constants.SURFACE, -x),  # the diagonal of a face
+        ([4, 2, 2], x, 0, constants.BURIED, 0 * x),
     ]
     t, _, what, normal = cast(scene, [2.25], [r[0] for r in rays], [r[1] for r in rays])
     np.testing.assert_allclose(t, [r[2] for r in rays], atol=1e-12)
@@ -234,7 +235,7 @@ def test_where_a_ray_touches_a_saddle_there_is_no_normal():
     scene = Scene.sky(Volume((2.0 * x - 1) * (2 * y - 1)), range=(-0.9, 0.9))
     along = np.array([-1, 1, 0]) / math.sqrt(2)
     t, _, what, normal = cast(scene, [0.0], [[0.5, 0.5, 0.5] - 0.5 * along], [along])
-    assert what == kernels.SURFACE
+    assert what == constants.SURFACE
     assert t == pytest.approx(0.5, abs=1e-7)
     assert not normal.any() or abs(normal[0] @ along) > 0.99  # or it is that of a rounding beside it
 
@@ -245,7 +246,7 @@ def test_a_path_that_starts_inside_another_solid_is_worth_nothing():
     point, normal = (2.5, 3.0, 2.0), (-1.0, 0.0, 0.0)
     for path in range(5):
         key = np.uint64(7)
-        start, light = (levels, 0, kernels.NOWHERE, point, normal), np.ones(3)
+        start, light = (levels, 0, constants.NOWHERE, point, normal), np.ones(3)
         kernels.walk(marchable(scene), key, np.uint64(path), 4, *start, np.ones(3), light)
         assert not light.any()
 
@@ -256,7 +257,7 @@ def test_a_lone_voxel_in_the_corner_of_eight_bricks_is_met(d):
     values[4, 4, 4] = 1
     d = np.array(d) / np.linalg.norm(d)
     t, _, what, normal = cast(Scene.sky(Volume(values), range=(0.1, 0.9)), [0.5], [4 - 20 * d], [d])
-    assert what == kernels.SURFACE
+    assert what == constants.SURFACE
     assert 19 < t < 20
     np.testing.assert_allclose(normal[0], -d, atol=1e-6)
 

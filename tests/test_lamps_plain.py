@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import naive
+from illumgrid import constants
 from illumgrid.backends import kernels
 from illumgrid.backends.numba_ import Numba
 from illumgrid.backends.reference import Reference
@@ -97,13 +98,13 @@ def test_camera_rays_see_the_fronts_of_quads_only():
     t, number, what, normal = np.empty(3), np.empty(3, np.int64), np.empty(3, np.int64), np.zeros((3, 3))
     levels = np.array([NOWHERE])
     kernels.cast_rays(layout, levels, origin, direction, -1, t, number, what, normal)
-    assert what.tolist() == [kernels.QUAD, kernels.MISS, kernels.QUAD]
+    assert what.tolist() == [constants.QUAD, constants.MISS, constants.QUAD]
     assert number.tolist() == [1, -1, 3]
     np.testing.assert_allclose(t, [4, math.inf, 3])
     np.testing.assert_allclose(normal, [Z, 0 * Z, Z])
     # the other way round
     kernels.cast_rays(layout, levels, origin, -direction, -1, t, number, what, normal)
-    assert what.tolist() == [kernels.MISS, kernels.QUAD, kernels.MISS]
+    assert what.tolist() == [constants.MISS, constants.QUAD, constants.MISS]
     # a ray that is no camera's meets both sides
     kernels.cast_rays(layout, levels, origin, direction, 1, t, number, what, normal)
     assert number.tolist() == [2, -1, 2]

@@ -14,9 +14,10 @@ import pytest
 import naive
 import naive_mesh
 from illumgrid import registry
-from illumgrid.backends import bvh, embree, meshes
+from illumgrid.backends import embree
 from illumgrid.backends.embree import Casting, Embree
-from illumgrid.backends.meshes import LevelMesh, Meshes, level_mesh, meshed, row_groups
+from illumgrid.backends.mesh import bvh, meshes
+from illumgrid.backends.mesh.meshes import LevelMesh, Meshes, level_mesh, meshed, row_groups
 from illumgrid.backends.numba_ import Numba
 from illumgrid.backends.reference import Reference, answer
 from illumgrid.errors import BadInput

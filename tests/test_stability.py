@@ -197,7 +197,8 @@ def test_constant_data_are_refused_and_said_why():
 
 def test_tangent_rays_neither_stick_nor_leak():
     """Rays that graze a ball: closer than its radius they hit, farther they pass, and on the rim either is allowed."""
-    from illumgrid.backends.kernels import MISS, SURFACE, cast_rays
+    from illumgrid.backends.kernels import cast_rays
+    from illumgrid.constants import MISS, SURFACE
     from illumgrid.field.levelset import marchable
 
     squares = sampled(lambda x: -(x**2).sum(axis=1), (21, 21, 21), origin=(-10,) * 3)

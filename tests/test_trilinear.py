@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
 
-from illumgrid.field.volume import ON_A_VOXEL, index_to_world, world_to_index
+from illumgrid.constants import ON_A_VOXEL
+from illumgrid.field.volume import index_to_world, world_to_index
 from illumgrid.grid import GridSpec, read_lattice
 from shapes import DIRECTIONS
 

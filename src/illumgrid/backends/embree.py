@@ -13,22 +13,17 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from illumgrid.backends.bvh import unit_cube
-from illumgrid.backends.meshes import LevelMesh, Meshes, meshed, row_groups
+from illumgrid.backends.mesh.bvh import unit_cube
+from illumgrid.backends.mesh.meshes import LevelMesh, Meshes, meshed, row_groups
 from illumgrid.backends.numba_ import pool, share
 from illumgrid.backends.reference import (
-    BURIED,
-    CAP,
-    LOST,
-    MISS,
-    NOWHERE,
-    SURFACE,
     Bools,
     Ints,
     answer,
     cell_normal,
     gradient_normal,
 )
+from illumgrid.constants import BURIED, CAP, LOST, MISS, NOWHERE, SURFACE
 from illumgrid.errors import BadInput
 from illumgrid.field.levelset import Marchable
 from illumgrid.field.scene import Scene
@@ -45,7 +40,7 @@ Cast = Callable[[int, Floats, Floats], tuple[Floats, Ints]]
 
 @dataclass(frozen=True)
 class Casting:
-    """Rays that are cast at the meshes of one row of levels, by whoever can: see `kernels.mesh_from`.
+    """Rays that are cast at the meshes of one row of levels, by whoever can: see `mesh.cast.mesh_from`.
 
     Parameters
     ----------
@@ -96,7 +91,7 @@ class Casting:
         return smooth
 
     def begin(self, own: Ints, x: Floats, normal: Floats) -> tuple[Floats, Ints]:
-        """Along the normal onto the mesh, or along that of the cell: see `kernels.settle`."""
+        """Along the normal onto the mesh, or along that of the cell: see `mesh.cast.settle`."""
         x, face = x.copy(), np.full(len(x), NOWHERE)
         for f in range(len(self.scene.start)):
             mine = np.flatnonzero(own == f)
@@ -107,7 +102,7 @@ class Casting:
         return x, face
 
     def settle(self, f: int, x: Floats, normal: Floats) -> tuple[Floats, Ints]:
-        """Onto a front against the normal, or a back along it, within a cell, no cap: see `kernels.settle_along`."""
+        """Onto a front against the normal, or a back along it, within a cell, no cap: see `mesh.cast.settle_along`."""
         reach = 1.0 / (np.abs(normal) / self.scene.spacing[f]).max(axis=1, initial=0.0)
         found, shift, face = np.full(len(x), np.inf), np.zeros(len(x)), np.full(len(x), LOST)
         near = 2.0 * self.scene.off[f]

@@ -20,7 +20,7 @@ from illumgrid.transport.samples import Queries, Samples, in_frame, in_turn
 from illumgrid.transport.tracer import laid_out, solve_once
 
 if TYPE_CHECKING:
-    from illumgrid.backends.meshes import Meshes
+    from illumgrid.backends.mesh.meshes import Meshes
 
 Rows = slice | NDArray[np.int64]
 
@@ -60,8 +60,8 @@ class Numba:
         """Lay the fields out; meshes are built when they are asked for."""
         meshes = None
         if self.surface == "mesh":
-            from illumgrid.backends import bvh
-            from illumgrid.backends.meshes import Meshes
+            from illumgrid.backends.mesh import bvh
+            from illumgrid.backends.mesh.meshes import Meshes
 
             meshes = Meshes(scene, bvh.build)
         return NumbaTracer(self, scene, *laid_out(scene), meshes, pool(self.threads))
@@ -131,7 +131,7 @@ class NumbaTracer:
         if self.meshes is None:
             yield self.fields, np.arange(len(level))
             return
-        from illumgrid.backends.meshes import meshed, row_groups
+        from illumgrid.backends.mesh.meshes import meshed, row_groups
 
         for row, members in row_groups(self.scene, level):
             yield meshed(self.fields, self.meshes.of(row)), members

@@ -11,9 +11,10 @@ from typing import ClassVar, Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from illumgrid.constants import BURIED, CAP, LOST, MISS, NOWHERE, ON_A_VOXEL, ON_A_WALL, QUAD, SURFACE, UNSEEN
 from illumgrid.field.levelset import Marchable
 from illumgrid.field.scene import Scene
-from illumgrid.field.volume import ON_A_VOXEL, Floats
+from illumgrid.field.volume import Floats
 from illumgrid.grid.channels import Channels
 from illumgrid.rng import draw, draw_pair, net_size, sharing, stream
 from illumgrid.stages import Backend, hookimpl
@@ -23,11 +24,7 @@ from illumgrid.transport.tracer import laid_out, solve_once
 Bools = NDArray[np.bool_]
 Ints = NDArray[np.int64]
 
-MISS, SURFACE, CAP, BURIED, QUAD = 0, 1, 2, 3, 4
-NOWHERE, LOST = -1, -2
-UNSEEN = 0.2  # as in illumgrid.backends.kernels
 BATCH = 1 << 15  # rays that take a step together
-ON_A_WALL = 1e-10  # a wall reaches this share of its size farther, so that walls joined at an edge leave no gap
 _CORNERS = np.array(list(np.ndindex(2, 2, 2)))
 
 

@@ -9,12 +9,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-BRICK = 4
-"""Cells along the side of a brick."""
+from illumgrid.constants import BRICK, REACH
+
 RANKS = 255
 """Steps from the lowest rank to the highest."""
-REACH = (1, 2, 3, 4, 6, 8, 16, 1 << 20)
-"""Sides, in bricks, of the cubes that a ray may leap over; the last one goes to the border of the field."""
 
 Bytes = NDArray[np.uint8]
 

@@ -10,6 +10,7 @@ from typing import Any, Literal, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from illumgrid.constants import ON_A_VOXEL
 from illumgrid.errors import BadInput, shown_range, tell
 
 Floats = NDArray[np.float64]
@@ -17,10 +18,6 @@ Side = Literal["above", "below"]
 
 UPWARD: dict[Side, float] = {"above": 1.0, "below": -1.0}
 """The sign with which a field's solid is where values are high: the solid of c is {UPWARD h >= UPWARD c}."""
-
-ON_A_VOXEL = 1e-7
-"""Index coordinates this close to an integer are rounded to it: a node on a voxel remains there after a round trip
-through world coordinates, even at origins 1e5 extents away (1e5 x 128 voxels x 2.2e-16 = 3e-9)."""
 
 
 class Lattice(Protocol):

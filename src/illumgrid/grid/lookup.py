@@ -3,7 +3,8 @@
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from illumgrid.field.volume import ON_A_VOXEL, Lattice
+from illumgrid.constants import ON_A_VOXEL
+from illumgrid.field.volume import Lattice
 
 
 def read_lattice(spec: Lattice, values: NDArray[np.float32], points: ArrayLike) -> NDArray[np.float32]:

@@ -6,6 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 from numpy.typing import NDArray
 
+from illumgrid.constants import CAP, SURFACE
 from illumgrid.field.levelset import turned_levels
 from illumgrid.field.volume import Floats
 from illumgrid.show.camera import Camera
@@ -43,7 +44,7 @@ def draw(shown: Shown, camera: Camera, width: int, height: int, background: Colo
     axes = shown.scene.fields[0].volume.direction
 
     def seen(directions: Floats) -> Colors:
-        from illumgrid.backends.kernels import CAP, SURFACE, cast_rays
+        from illumgrid.backends.kernels import cast_rays
 
         direction, n = directions @ axes, len(directions)
         origin = np.tile(eye, (n, 1))

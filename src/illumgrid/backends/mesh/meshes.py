@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from illumgrid.backends import bvh
+from illumgrid.backends.mesh import bvh
 from illumgrid.errors import BadInput
 from illumgrid.field.levelset import Marchable, extract
 from illumgrid.field.scene import Field, Scene
