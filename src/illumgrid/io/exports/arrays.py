@@ -1,5 +1,6 @@
 """The light of a field as arrays on a lattice, and the formats that hold arrays."""
 
+import gzip
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -82,7 +83,10 @@ def _at(light: "Illumination", number: int, world: Floats, names: set[str]) -> d
     if names & {"error", "support"}:
         here["error"], here["support"] = grid.certainty(world)
     if "field" in names:
-        here["field"] = interpolate(field.volume, world_to_index(field.volume, world)).astype(np.float32)
+        values = interpolate(field.volume, world_to_index(field.volume, world))
+        # Where the field has an offset or scale that single precision does not hold, nor does the file.
+        plain = field.volume.slope == 1 and field.volume.intercept == 0
+        here["field"] = values.astype(np.float32) if plain else values
     return here
 
 
@@ -92,22 +96,37 @@ def x_fastest(array: NDArray[Any]) -> NDArray[Any]:
 
 
 def write_nrrd(path: Path, points: Points, progress: "Progress") -> None:
-    """Write the one array of `points`; space left-posterior-superior, directions as in the world."""
-    import SimpleITK as sitk  # noqa: N813  (its usual name)
-
+    """Write the one array of `points`; space left-posterior-superior, directions as in the world; gzip."""
     ((name, array),) = points.arrays.items()
     progress("file", 0, 1)
-    image = sitk.GetImageFromArray(x_fastest(array), isVector=array.ndim == 4)
-    image.SetOrigin(points.lattice.origin.tolist())
-    image.SetSpacing(points.lattice.spacing.tolist())
-    image.SetDirection(points.lattice.direction.ravel().tolist())
+    lattice = points.lattice
+    steps = [_vector(lattice.direction[:, axis] * lattice.spacing[axis]) for axis in range(3)]
+    color = array.ndim == 4
+    head = {
+        "type": {"f4": "float", "f8": "double", "u1": "uint8"}[array.dtype.str[1:]],
+        "dimension": 4 if color else 3,
+        "space": "left-posterior-superior",
+        "sizes": " ".join(map(str, (3, *lattice.shape) if color else lattice.shape)),
+        "space directions": " ".join(["none", *steps] if color else steps),
+        "kinds": f"{'vector ' if color else ''}domain domain domain",
+        "endian": "little",
+        "encoding": "gzip",
+        "space origin": _vector(lattice.origin),
+    }
     about = {"illumgrid array": name, "illumgrid field": points.field}
     if name == "color":
         about["illumgrid exposure"] = repr(points.exposure)
-    for key, value in about.items():
-        image.SetMetaData(key, value)
-    sitk.WriteImage(image, str(path), useCompression=True)
+    lines = ["NRRD0004", *(f"{k}: {v}" for k, v in head.items()), *(f"{k}:={v}" for k, v in about.items()), "", ""]
+    data = x_fastest(array).astype(array.dtype.newbyteorder("<"), copy=False)
+    with open(path, "wb") as file:
+        file.write("\n".join(lines).encode())
+        with gzip.GzipFile(fileobj=file, mode="wb", compresslevel=6, mtime=0) as packed:
+            packed.write(data.data)
     progress("file", 1, 1)
+
+
+def _vector(numbers: Floats) -> str:
+    return f"({','.join(repr(float(x)) for x in numbers)})"
 
 
 def write_exr(path: Path, points: Points, progress: "Progress") -> None:
@@ -124,7 +143,9 @@ def write_exr(path: Path, points: Points, progress: "Progress") -> None:
         "exposure": points.exposure,
     }  # fmt: skip
     channels = {
-        "RGB" if name == "irradiance" else name: x_fastest(array).reshape(nz * ny, nx, *array.shape[3:])
+        "RGB" if name == "irradiance" else name: x_fastest(array.astype(np.float32, copy=False)).reshape(
+            nz * ny, nx, *array.shape[3:]
+        )
         for name, array in points.arrays.items()
         if name != "color"  # an EXR viewer makes its own
     }

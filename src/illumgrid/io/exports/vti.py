@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 _BLOCK = 1 << 18
 """Bytes that are packed together."""
 
-_TYPES = {"float32": "Float32", "uint8": "UInt8"}
+_TYPES = {"float32": "Float32", "float64": "Float64", "uint8": "UInt8"}
 
 
 def write(path: Path, points: Points, progress: "Progress") -> None:
