@@ -235,6 +235,6 @@ def join_samples(parts: Sequence[Samples]) -> Samples:
 
 
 def in_frame(scene: Scene, queries: Queries) -> tuple[Floats, Floats, Floats]:
-    """Points (n, 3) and normals (n, 3) of queries in the frame of the scene, and their levels (n, F) times `upward`."""
+    """Points (n, 3) and normals (n, 3) of queries in the frame of the scene, and their `turned_levels` (n, F)."""
     axes = scene.fields[0].volume.direction
     return scene.to_frame(queries.point), queries.normal @ axes, turned_levels(scene, queries.level)
