@@ -73,7 +73,7 @@ class Queries:
         """
         world = np.asarray(points, dtype=float).reshape(-1, 3)
         if not 0 <= field < len(scene.fields):
-            raise BadInput(f"the field number is {field}; expected a number from 0 to {len(scene.fields) - 1}")
+            raise BadInput(f"field {field} was requested; expected a number from 0 to {len(scene.fields) - 1}")
         own = scene.fields[field]
         index = world_to_index(own.volume, np.where(np.isfinite(world), world, np.nan))  # infinite points are nowhere
         top = np.array(own.volume.shape) - 1
