@@ -6,6 +6,7 @@ Computing in Science & Engineering, 2007).
 """
 
 import importlib
+import os
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -19,6 +20,11 @@ if TYPE_CHECKING:
     from illumgrid.light import Illumination
     from illumgrid.registry import backend, interpolator, sampler
     from illumgrid.transport.samples import Queries, Samples
+
+# Numba refuses to be imported with a number of threads that is none; nothing here uses its threads.
+_threads = os.environ.get("NUMBA_NUM_THREADS", "1").strip()
+if not _threads.isdecimal() or int(_threads) < 1:
+    del os.environ["NUMBA_NUM_THREADS"]
 
 __all__ = [
     "BadInput",

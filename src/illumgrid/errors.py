@@ -24,6 +24,7 @@ WARNINGS = {
     "file": "something in a file that was assumed, or is lost",
     "dicom": "a DICOM series with slices that are missing, unevenly spaced, tilted or left out",
     "choice": "a file with several arrays, of which the marked one was read",
+    "compiler": "compiled code that cannot be kept on the disk, or cannot be read from there",
     "plugin": "a plugin that does not load, or two that claim one name",
     "labels": "a volume that looks like a map of labels and is lit as a field",
     "plateau": "the range holds a value on which the field is flat",

@@ -21,6 +21,8 @@ from llvmlite import ir
 from numba import types
 from numba.extending import lower_builtin, models, register_model, type_callable
 
+from illumgrid.compiled import njit
+
 WIDE = 8
 
 
@@ -51,8 +53,7 @@ def cached(*sources: ModuleType, **options: Any) -> Callable[[Any], Any]:
 
     def compiled(function: Any) -> Any:
         function.__qualname__ += f"_{digest}"
-        # No fastmath: what is computed must not depend on the processor, and infinity means something.
-        return numba.njit(cache=True, nogil=True, error_model="numpy", **options)(function)
+        return njit(**options)(function)
 
     return compiled
 

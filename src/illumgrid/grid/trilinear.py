@@ -1,17 +1,17 @@
 """The lookup, compiled: trilinear values of a lattice at world points. Imported where it is first used."""
 
-import numba
+from illumgrid.compiled import njit
 
 FAR = 1e300  # as far as a coordinate can be, for one that is infinite
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", _nrt=False)  # type: ignore[call-overload]
+@njit(_nrt=False)
 def finite(x):
     """A coordinate that arithmetic keeps finite; 0 for NaN."""
     return min(max(x, -FAR), FAR) if x == x else 0.0
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", _nrt=False)  # type: ignore[call-overload]
+@njit(_nrt=False)
 def read(values, origin, direction, spacing, snap, points, result):
     """Fill `result` (n, m) from `values` (nx, ny, nz, m), whose node 0 lies at `origin`, at world points (n, 3).
 

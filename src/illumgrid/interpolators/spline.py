@@ -1,9 +1,10 @@
 """Compiled weights of local biharmonic splines. Serial, stateless, with the GIL released; the caller runs threads."""
 
-import numba
 import numpy as np
 
-jit = numba.njit(cache=True, nogil=True, error_model="numpy")
+from illumgrid.compiled import njit
+
+jit = njit()
 
 AMPLIFIES = 2.0
 """Sum of |weights| of a node above which a ridge is added: the largest amplification of errors of its samples."""

@@ -1,0 +1,88 @@
+"""Compilation by Numba with a cache on disk that costs time where it fails, and never the run.
+
+Numba alone refuses to compile where it may write nowhere, and raises whatever a damaged file of its cache makes of it;
+it does not notice damage within machine code.
+"""
+
+import contextlib
+import hashlib
+import pickle
+from collections.abc import Callable
+from typing import Any
+
+import numba
+from numba.core.caching import CompileResultCacheImpl, FunctionCache
+from numba.core.serialize import dumps
+
+from illumgrid.errors import tell
+
+_said: set[str] = set()
+
+
+def _say(what: str, problem: Exception) -> None:
+    """Say once in a process that the cache is of no use."""
+    if what not in _said:
+        _said.add(what)
+        reason = " ".join(str(problem).split())[:160] or type(problem).__name__
+        tell("compiler", f"{what}; it takes up to a minute at each start ({reason})", stacklevel=2)
+
+
+class _Summed(CompileResultCacheImpl):
+    """Compiled code with a checksum."""
+
+    def reduce(self, compiled: Any) -> tuple[bytes, bytes]:
+        """What is kept."""
+        content = dumps(super().reduce(compiled))
+        return content, hashlib.sha256(content).digest()
+
+    def rebuild(self, context: Any, kept: tuple[bytes, bytes]) -> Any:
+        """From what is kept."""
+        content, digest = kept
+        if hashlib.sha256(content).digest() != digest:
+            raise ValueError("its checksum is another")
+        return super().rebuild(context, pickle.loads(content))
+
+    def get_filename_base(self, name: str, flags: str) -> str:
+        """A name that the files of Numba do not have."""
+        return f"{super().get_filename_base(name, flags)}.summed"
+
+
+class _Cache(FunctionCache):
+    """A cache whose trouble is said and passed over."""
+
+    _impl_class = _Summed
+
+    def load_overload(self, signature: Any, context: Any) -> Any:
+        """Compiled code from the disk, or None."""
+        try:
+            return super().load_overload(signature, context)
+        except Exception as problem:  # whatever unpickling makes of damaged bytes
+            _say("compiled code on the disk cannot be read and is made anew", problem)
+            with contextlib.suppress(OSError):
+                self.flush()
+            return None
+
+    def save_overload(self, signature: Any, compiled: Any) -> None:
+        """Keep compiled code, if that is possible."""
+        try:
+            super().save_overload(signature, compiled)
+        except Exception as problem:  # the disk is full, the folder is gone or not ours
+            _say("compiled code cannot be kept on the disk", problem)
+
+
+def njit(**options: Any) -> Callable[[Any], Any]:
+    """Compile a function, and keep what comes out on the disk where that is possible.
+
+    No fastmath: what is computed must not depend on the processor, and infinity means something.
+    """
+
+    def made(function: Any) -> Any:
+        dispatcher = numba.njit(nogil=True, error_model="numpy", **options)(function)
+        if hasattr(dispatcher, "py_func"):  # not with NUMBA_DISABLE_JIT=1
+            try:
+                dispatcher._cache = _Cache(function)  # as its method enable_caching does
+            except (RuntimeError, OSError) as problem:
+                _say("compiled code cannot be kept on the disk", problem)
+        return dispatcher
+
+    return made

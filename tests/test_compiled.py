@@ -1,0 +1,89 @@
+"""Compilation where the cache on the disk is of no use: it costs time, and the answer is the same."""
+
+import importlib.util
+import os
+import subprocess
+import sys
+
+import pytest
+
+from illumgrid import compiled
+from illumgrid.errors import IllumgridWarning
+
+CODE = "from illumgrid.compiled import njit\n\n@njit()\ndef f(x):\n    return 2.5 * x\n"
+
+pytestmark = pytest.mark.skipif(os.environ.get("NUMBA_DISABLE_JIT") == "1", reason="nothing is compiled")
+
+
+@pytest.fixture
+def function(tmp_path, monkeypatch):
+    """Imports a module with a compiled function anew at each call."""
+    monkeypatch.setattr(compiled, "_said", set())
+    (tmp_path / "made.py").write_text(CODE)
+
+    def again():
+        spec = importlib.util.spec_from_file_location("made", tmp_path / "made.py")
+        module = importlib.util.module_from_spec(spec)
+        monkeypatch.setitem(sys.modules, "made", module)
+        spec.loader.exec_module(module)
+        return module.f
+
+    return again
+
+
+def kept(tmp_path, ending):
+    return next((tmp_path / "__pycache__").glob(f"*.{ending}"))
+
+
+def test_it_is_kept_and_found(function):
+    assert function()(2.0) == 5
+    again = function()
+    assert again(2.0) == 5 and sum(again.stats.cache_hits.values()) == 1
+
+
+@pytest.mark.parametrize("ending", ["nbi", "nbc"])
+@pytest.mark.parametrize("damage", ["empty", "cut", "noise", "bit"])
+def test_a_damaged_cache_is_made_anew(tmp_path, function, ending, damage):
+    function()(2.0)
+    file = kept(tmp_path, ending)
+    whole = bytearray(file.read_bytes())
+    if damage == "bit":
+        whole[-200 if ending == "nbc" else 3] ^= 1  # within machine code
+    file.write_bytes({"empty": b"", "cut": whole[: len(whole) // 2], "noise": b"\xff" * 99, "bit": whole}[damage])
+    if (ending, damage) == ("nbi", "bit"):
+        function()(2.0)  # of another version, for all that Numba can see
+    else:
+        with pytest.warns(IllumgridWarning, match="compiler: compiled code on the disk cannot be read"):
+            assert function()(2.0) == 5
+    again = function()
+    assert again(2.0) == 5 and sum(again.stats.cache_hits.values()) == 1
+
+
+def test_nowhere_to_write(tmp_path, function, monkeypatch):
+    import numba
+
+    monkeypatch.setattr(numba.config, "CACHE_LOCATOR_CLASSES", "UserProvidedCacheLocator")  # which nobody provided
+    with pytest.warns(IllumgridWarning, match="compiler: compiled code cannot be kept .* no locator"):
+        f = function()
+    assert f(2.0) == 5
+    assert function()(2.0) == 5  # and is said once
+
+
+def test_a_full_disk(tmp_path, function, monkeypatch):
+    from numba.core.caching import IndexDataCacheFile
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(IndexDataCacheFile, "_save_data", full)
+    with pytest.warns(IllumgridWarning, match="cannot be kept .*No space left"):
+        assert function()(2.0) == 5
+
+
+@pytest.mark.parametrize("threads", ["0", "-3", "many", ""])
+def test_a_number_of_threads_that_is_none(threads):
+    code = "import illumgrid.compiled as c; print(c.njit()(lambda x: x + 1)(1))"
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, env={**os.environ, "NUMBA_NUM_THREADS": threads}
+    )
+    assert done.stdout == "2\n", done.stderr
