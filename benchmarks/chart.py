@@ -31,7 +31,7 @@ from rays import gaussians
 
 from illumgrid import Queries, Scene, Volume, backend, isosurface, read_volume, run
 from illumgrid.accuracy.chart import bench, sizes
-from illumgrid.accuracy.chart.methods import methods, tracers
+from illumgrid.accuracy.chart.contestants import methods, tracers
 from illumgrid.accuracy.chart.race import SEEDS, Race, front
 from illumgrid.accuracy.choose import planned
 from illumgrid.accuracy.judge import judge

@@ -1,6 +1,7 @@
 """The race and what is made of it."""
 
 import csv
+import itertools
 import json
 import warnings
 from dataclasses import dataclass, replace
@@ -12,9 +13,12 @@ import pytest
 
 from illumgrid import registry
 from illumgrid import run as run_chain
-from illumgrid.accuracy.chart import _references, _remarks, _show_default, _thinned, _tracer_of, bench
+from illumgrid.accuracy import chart as benches
+from illumgrid.accuracy import cost
+from illumgrid.accuracy.chart import _references, _remarks, _show_default, _thinned, _tracer_of, bench, contestants
+from illumgrid.accuracy.chart import race as races
 from illumgrid.accuracy.chart import sizes as sizes_of
-from illumgrid.accuracy.chart.methods import COUNTS, Method, methods, tracers
+from illumgrid.accuracy.chart.contestants import COUNTS, Method, methods, tracers
 from illumgrid.accuracy.chart.race import Point, Race, Run, covered, front
 from illumgrid.accuracy.cost import Pace
 from illumgrid.accuracy.points import unseen_on_level_sets
@@ -183,7 +187,16 @@ def test_a_budget_or_a_scene_that_cannot_be_is_refused():
     refused(lambda: bench(sky(), 0.0), "budget of 0 seconds", "such as 60")
 
 
-def test_bench_writes_what_it_says_whole_and_once(call, tmp_path):
+@pytest.fixture
+def ticking(monkeypatch):
+    """A clock that goes on by a fixed step whenever it is read: no machine is too slow for a budget."""
+    ticks = itertools.count(step=0.1)
+    for module in (benches, cost, contestants, races):
+        monkeypatch.setattr(module, "time", SimpleNamespace(perf_counter=lambda: next(ticks)))
+    monkeypatch.setattr(cost, "timeit", SimpleNamespace(repeat=lambda work, **_: [work() and 0.1]))
+
+
+def test_bench_writes_what_it_says_whole_and_once(call, tmp_path, ticking):
     arguments = ("bench", "v.npy", "--range", 0.3, 0.9, "--budget", 3, "--seed", 2**64 - 1, "-o", "b")
     said = call(*arguments)
     assert "the front:" in said and "for 10% use --sampler" in said and "wrote b" in said

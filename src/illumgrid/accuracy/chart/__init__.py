@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from illumgrid import registry, tone
-from illumgrid.accuracy.chart.methods import Method, methods, tracers
+from illumgrid.accuracy.chart.contestants import Method, methods, tracers
 from illumgrid.accuracy.chart.race import SEEDS, Flip, Point, Race, front
 from illumgrid.accuracy.cost import measure_pace
 from illumgrid.accuracy.points import unseen_on_level_sets

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from illumgrid.accuracy.chart.methods import COUNTS, Method
+from illumgrid.accuracy.chart.contestants import COUNTS, Method
 from illumgrid.accuracy.reference import Reference, errors, look_up
 from illumgrid.bake import Bake, shifted_seed
 from illumgrid.errors import BadInput
