@@ -9,7 +9,7 @@ import stat
 import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any, Literal
 
@@ -69,12 +69,12 @@ def open_regular(file: Path) -> IO[bytes]:
     return open(number, "rb")
 
 
-def find_source(file: Path) -> Source:
-    """Look at the beginning of a file."""
+def find_source(file: Path, whole: bool = True) -> Source:
+    """Look at the beginning of a file; where it is gzipped as a `whole`, of what it unpacks to."""
     with open_regular(file) as stream:
         size = os.fstat(stream.fileno()).st_size
         head = stream.read(HEAD)
-    if not head.startswith(b"\x1f\x8b"):
+    if not (whole and head.startswith(b"\x1f\x8b")):
         return Source(file, size, head, packed=False)
     source = Source(file, size, b"", packed=True)
     with opened(source) as stream:
@@ -135,7 +135,7 @@ def beside(source: Source, named: str) -> Source:
                 f"its data file {named} is a link to a place outside the folder of the header; expected a file beside "
                 "it; copy the data there"
             )
-        return replace(find_source(place), packed=False)
+        return find_source(place, whole=False)
     except OSError as problem:
         raise BadInput(
             f"its data file {named} cannot be read ({problem.strerror}); check its name and rights"
