@@ -308,14 +308,14 @@ def test_a_cut_slice_is_refused(tmp_path):
     whole = last.read_bytes()
     for cut in (9, 59, 62, 400):
         last.write_bytes(whole[:-cut])
-        refused(tmp_path / "a", "3.dcm", "whole")
+        refused(tmp_path / "a", "3.dcm")
 
 
 def test_no_stack(tmp_path):
     write(tmp_path / "a.nrrd")
     refused(tmp_path, "none", "DICOM")
     write_series(tmp_path / "scan", values("uint16")[:, :, :1])
-    refused(tmp_path / "scan", "1.2.3", "1 planes")
+    refused(tmp_path / "scan", "1.2.3", "a single plane")
     refused(next((tmp_path / "scan").iterdir()), "5x6x1", "folder")
 
 

@@ -17,7 +17,7 @@ from illumgrid.io.readers.dicom_frames import Frame, frames_of, text
 from illumgrid.io.readers.dicom_pixels import dataset, decoded, on_lattice, planes_of, quiet, scaled, understood
 from illumgrid.io.readers.dicom_stack import arranged, phases, placed, stacks
 from illumgrid.io.readers.limits import AS_FLOAT, check_axes, check_memory
-from illumgrid.io.readers.source import AGAIN, Source, find_source
+from illumgrid.io.readers.source import Source, find_source
 from illumgrid.io.readers.stored import Note, Stored, Wanted, pick
 
 MOST_FILES = 200_000
@@ -94,11 +94,15 @@ def _frames(source: Source, names: dict[str, str] | None = None) -> list[Frame]:
         meta = getattr(header, "file_meta", None)
         stored = pydicom.uid.UID(text(meta or {}, "MediaStorageSOPClassUID") or text(header, "SOPClassUID"))
         if stored == pydicom.uid.MediaStorageDirectoryStorage:
+            if names is not None:
+                return []
             raise BadInput("the index of a medium (DICOMDIR), no image; expected slices; give the folder it lies in")
         found = frames_of(header, source.file, source.most)
         uid = text(header, "SOPInstanceUID")
-    if not found and (not stored or any(word in stored.name for word in IMAGES)):
-        raise BadInput(f"its DICOM header ends too early; {AGAIN}")
+    if not found and not stored:
+        raise BadInput("does not say what object of DICOM it is, or ends before that; expected slices; copy it again")
+    if not found and any(word in stored.name for word in IMAGES):
+        raise BadInput(f"is a {stored.name} without pixels, or ends before them; expected whole slices; copy it again")
     if found and names is not None and uid:
         if uid in names:
             names["copies"] = source.file.name
@@ -109,9 +113,9 @@ def _frames(source: Source, names: dict[str, str] | None = None) -> list[Frame]:
 
 def _chosen(frames: Sequence[Frame], wanted: Wanted, sources: dict[Path, Source]) -> Stored:
     """The volume that is left after the choice of series (array), phase (time) and colour (channel)."""
-    if all(frame.kind.segments for frame in frames):
-        return _label_map(_series(frames, wanted)[0], sources)
     group, notes = _series(frames, wanted)
+    if group[0].kind.segments:
+        return _label_map(group, sources)
     if any(frame.moment for frame in group):
         raise BadInput(
             f"a film: its {len(group)} frames are moments of one plane; expected slices; there is no volume in it"
@@ -140,9 +144,11 @@ def _series(frames: Sequence[Frame], wanted: Wanted) -> tuple[list[Frame], list[
     if not any(len(group) > 1 for group in groups):
         k = frames[0].kind
         uids = ", ".join(sorted({frame.kind.series for frame in frames})[:4])
+        count = len(frames)
+        what = "a single plane" if count == 1 else f"{count} planes, none of which are parallel and of equal size"
         raise BadInput(
-            f"its DICOM series are: {uids}, {len(frames)} planes of {k.columns}x{k.rows} that are not parallel or of "
-            "equal size; expected one stack of slices; give a folder with a whole series"
+            f"its DICOM series are: {uids}, {what} ({k.columns}x{k.rows}); expected one stack of slices; give a folder "
+            "with a whole series"
         )
     choices = sorted(groups, key=lambda group: len(group) < 2)
     return choices[pick(wanted.array, "array", [_named(group) for group in choices])], []

@@ -86,7 +86,7 @@ def numbers(item: Any, keyword: str, count: int | None = None) -> list[float] | 
             return None
         found = [float(v) for v in (value if isinstance(value, Sequence) and not isinstance(value, str) else [value])]
     except (ValueError, TypeError, OverflowError, AttributeError):
-        raise BadInput(f"its {keyword} is no number; expected {count or 'some'}; mend its header") from None
+        raise BadInput(f"its {keyword} is no number; expected one; mend its header") from None
     if not found:
         return None
     if count not in (None, len(found)) or not np.isfinite(found).all():
