@@ -194,6 +194,9 @@ def test_a_bar_is_as_long_as_it_says_at_the_middle_of_the_object():
     drawn = scale_bar(empty, camera, np.zeros(3), light.scene.fields[0].volume)
     columns = np.flatnonzero((drawn[-12] > 100).all(axis=1))
     assert np.ptp(columns) + 1 == len(columns)
+    volume = light.scene.fields[0].volume
+    named = scale_bar(empty, camera, np.zeros(3), replace(volume, unit="mm"))
+    assert np.array_equal(named[-12], drawn[-12]) and (named[:-14] > 100).sum() > 1.5 * (drawn[:-14] > 100).sum()
     depth = -camera.eye @ camera.forward
     length = len(columns) * 2 * camera.tangent * depth / 600
     assert min(abs(length / step - 1) for step in (0.1, 0.2, 0.5, 1)) < 0.02

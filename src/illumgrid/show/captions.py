@@ -45,13 +45,12 @@ def scale_bar(picture: Picture, camera: Camera, middle: Floats, volume: Volume) 
     size = _text_size(picture)
     unit = float((middle - camera.eye) @ camera.forward) * 2 * camera.tangent / height  # world units per pixel
     length = round_down(BAR * width * unit)
-    name = getattr(volume, "unit", None)
     image = Image.fromarray(picture)
     draw, ink = ImageDraw.Draw(image), _ink(picture[-2 * size :, -width // 4 :])
     right, bottom = width - size, height - size // 2
     left = right - round(length / unit)
     draw.rectangle((left, bottom - max(2, size // 6), right, bottom), fill=ink)
-    words = f"{length:g} {name}" if name else f"{length:g}"
+    words = f"{length:g} {volume.unit}" if volume.unit else f"{length:g}"
     draw.text(((left + right) / 2, bottom - size // 2), words, ink, _font(size), anchor="ms")
     return np.asarray(image)
 
