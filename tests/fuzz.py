@@ -19,11 +19,13 @@ import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pydicom
 import pydicom.data
 import SimpleITK as sitk  # noqa: N813
+import tifffile
 
 from dicom_files import HOUNSFIELD, enhanced
 from grid_files import cube_file, dx_file
@@ -69,6 +71,32 @@ def _volume(ending: str) -> Target:
         return file
 
     return Target(ending, make, lambda file: read_volume(file.parent if file.suffix == ".dcm" else file))
+
+
+def _tiff(name: str, **options: Any) -> Target:
+    """A TIFF stack as other programs write it."""
+
+    def make(folder: Path) -> Path:
+        file = folder / f"a.{'ome.' if name == 'ome' else ''}tif"
+        tifffile.imwrite(file, np.ascontiguousarray(values("uint16").T), **options)
+        return file
+
+    return Target(f"tif {name}", make, read_volume)
+
+
+def _header(ending: str) -> Target:
+    """A header whose data are in a file beside it."""
+
+    def make(folder: Path) -> Path:
+        write(folder / f"a.{ending}", values("float32"), compress=ending == "mhd")
+        return folder / f"a.{ending}"
+
+    return Target(ending, make, read_volume)
+
+
+def _meta_packed(folder: Path) -> Path:
+    write(folder / "a.mha", values("int16"), compress=True)
+    return folder / "a.mha"
 
 
 def _packed(name: str) -> Target:
@@ -158,6 +186,12 @@ def _run(part: str, sealed: bool) -> Target:
 
 TARGETS = (
     *map(_volume, ("nrrd", "nii", "nii.gz", "mha", "mrc", "vtk", "gipl", "tif", "dcm", "npy", "npz", "npy.gz")),
+    *map(_header, ("mhd", "nhdr", "hdr")),
+    Target("mha packed", _meta_packed, read_volume),
+    _tiff("imagej", imagej=True, metadata={"axes": "ZYX", "spacing": 0.5}, resolution=(5, 5)),
+    _tiff("ome", metadata={"axes": "ZYX", "PhysicalSizeX": 0.5}, photometric="minisblack"),
+    *(_tiff(codec, compression=codec, photometric="minisblack") for codec in ("lzw", "zstd", "jpeg2000", "packbits")),
+    _tiff("tiles", compression="deflate", predictor=True, tile=(16, 16), photometric="minisblack"),
     Target("frames", lambda folder: enhanced(folder / "a.dcm", [3, 0, 2, 1], [HOUNSFIELD] * 4), read_volume),
     *map(
         _packed, ("MR_small_RLE.dcm", "MR_small_jpeg_ls_lossless.dcm", "MR_small_jp2klossless.dcm", "JPGExtended.dcm")
