@@ -121,3 +121,15 @@ def test_damaged_gzip_is_refused(tmp_path):
     data[1000] ^= 1
     file.write_bytes(data)
     refused(file, "CRC")
+
+
+@pytest.mark.filterwarnings("ignore::ResourceWarning")  # nibabel leaves the file open
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+@pytest.mark.parametrize("ending", ["mgh", "mgz"])
+def test_freesurfer(tmp_path, ending):
+    from nibabel.freesurfer.mghformat import MGHImage
+
+    nibabel.save(MGHImage(values("int16"), AFFINE), tmp_path / f"a.{ending}")
+    lies_as_nibabel_says(tmp_path / f"a.{ending}", read_volume(tmp_path / f"a.{ending}"))
+    nibabel.save(MGHImage(values("float32", (5, 6, 7, 2)), AFFINE), tmp_path / f"a.{ending}")
+    refused(tmp_path / f"a.{ending}", "holds 2 time steps")

@@ -41,6 +41,7 @@ FAMILIES = (
         chooses=("channel", "time"),
         medical=True,
     ),
+    Family("FreeSurfer", "mgh", (".mgh", ".mgz"), (), ("time",), True),
     Family(
         *("MetaImage", "meta", (".mha", ".mhd")),
         starts=((0, b"ObjectType"), (0, b"NDims")),

@@ -45,6 +45,12 @@ def _promised(source: Source) -> int:
 
 
 def _read(source: Source, file: Path) -> Stored:
+    if source.ending != ".gipl":
+        with open(file, "rb") as stream:
+            if b"ITKImage" not in stream.read(CHUNK):
+                raise BadInput(
+                    "an HDF5 file that ITK did not write; expected ITK's layout; save the array as .npy or .nrrd"
+                )
     with _quiet():
         reader = sitk.ImageFileReader()
         reader.SetImageIO("GiplImageIO" if source.ending == ".gipl" else "HDF5ImageIO")

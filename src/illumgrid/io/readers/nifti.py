@@ -133,25 +133,26 @@ def _scaling(header: Any) -> tuple[float, float, tuple[Note, ...]]:
 def _place(header: Any) -> tuple[tuple[NDArray[np.float64], NDArray[np.float64]], tuple[Note, ...]]:
     """Origin and steps in LPS, by sform, else qform, else the spacing alone; and where they differ."""
     if not hasattr(header, "get_qform"):
-        return _in_lps(header.get_best_affine()), (("placement", f"is an Analyze file, {_UNPLACED}"),)
+        return in_lps(header.get_best_affine()), (("placement", f"is an Analyze file, {_UNPLACED}"),)
     qform, sform = header.get_qform(coded=True)[0], header.get_sform(coded=True)[0]
     if sform is None and qform is None:
-        return _in_lps(header.get_base_affine()), (("placement", f"sets neither qform nor sform, {_UNPLACED}"),)
+        return in_lps(header.get_base_affine()), (("placement", f"sets neither qform nor sform, {_UNPLACED}"),)
     if sform is None or qform is None:
-        return _in_lps(qform if sform is None else sform), ()
+        return in_lps(qform if sform is None else sform), ()
     corners = np.array(list(np.ndindex(2, 2, 2))) * (np.array(header.get_data_shape()[:3]) - 1)
     apart = corners @ (sform - qform)[:3, :3].T + (sform - qform)[:3, 3]
     far = float(np.linalg.norm(apart, axis=1).max() / min(header.get_zooms()[:3]))
     if far < SAME:
-        return _in_lps(qform), ()
+        return in_lps(qform), ()
     told = f"its qform and sform place a voxel up to {far:.3g} voxels differently; the sform was taken, as nibabel does"
-    return _in_lps(sform), ((("placement", told),) if far > FAR else ())
+    return in_lps(sform), ((("placement", told),) if far > FAR else ())
 
 
 _UNPLACED = "which does not say how its axes lie: x to the left and the middle at 0 was taken, as nibabel does"
 
 
-def _in_lps(affine: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def in_lps(affine: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Origin and steps in LPS of a matrix that gives RAS."""
     return TO_LPS @ affine[:3, 3] + 0.0, TO_LPS @ affine[:3, :3] + 0.0
 
 

@@ -107,12 +107,33 @@ def _opened_tiff(source: Source) -> Iterator[tuple[Any, list[str]]]:
     try:
         # tifffile reads on where pages or tags are lost, and reports it.
         with seekable(source) as stream, tifffile.TiffFile(stream, name=source.name, _multifile=False) as tiff:
+            _check_directories(tiff)
             yield tiff, ear.reports
     except tifffile.TiffFileError as problem:
         raise BadInput(f"is not a whole TIFF ({_plain(str(problem))}); {AGAIN}") from None
     finally:
         log.removeHandler(ear)
         log.propagate = propagated
+
+
+def _check_directories(tiff: Any) -> None:
+    """Refuse directories that overlap: in a few kilobytes they could hold tags for hours."""
+    file, form, total = tiff.filehandle, tiff.tiff, 0
+
+    def number(count: int) -> int:
+        return int.from_bytes(file.read(count), "little" if form.byteorder == "<" else "big")
+
+    file.seek(form.offsetsize)
+    at = number(form.offsetsize)
+    while 0 < at < file.size:
+        file.seek(at)
+        length = form.tagnosize + number(form.tagnosize) * form.tagsize + form.offsetsize
+        total += length
+        if total > file.size:
+            raise BadInput(f"the pages of this TIFF run in a circle or overlap; {AGAIN}")
+        file.seek(at + length - form.offsetsize)
+        at = number(form.offsetsize)
+    file.seek(0)
 
 
 def _plain(text: str) -> str:
