@@ -24,8 +24,9 @@ from illumgrid import Scene, isosurface
 from illumgrid.field.scene import level_table
 from illumgrid.grid import GridSpec, IlluminationGrid
 from illumgrid.light import Illumination
-from illumgrid.show import choose_engine, fit_camera, gl, meshes
-from illumgrid.show.shade import BACKGROUND, Shown
+from illumgrid.show import BACKGROUND, choose_engine, fit_camera, triangles
+from illumgrid.show.engines import gl
+from illumgrid.show.shade import Shown, opaque
 from illumgrid.tone import srgb_curve
 
 NODES, WIDTH, HEIGHT = 96, 800, 600
@@ -60,19 +61,19 @@ def measure(voxels, engine, rounds):
     """All measurements for one field size."""
     light = lit(gaussians(voxels))
     field, row = light.scene.fields[0], np.array([ISOVALUE])
-    camera, ground = fit_camera(light.scene, row, WIDTH / HEIGHT), np.full(3, BACKGROUND, np.float32)
+    camera, ground = fit_camera(light.scene, row, WIDTH / HEIGHT), opaque(np.full(3, BACKGROUND, np.float32))
     shown = Shown(light, row, 0.5, local=False)
-    plain = meshes.triangles(shown, camera.eye)
+    plain = triangles.seen(shown, camera.eye)
     points = plain[0].points
     colors, facing = shown.field(0, points, np.zeros(len(points))), np.zeros(len(points))
     parts = {
-        "frame": lambda: drawn(meshes.triangles(shown, camera.eye)),
-        "triangles": lambda: meshes.triangles(shown, camera.eye),
+        "frame": lambda: drawn(triangles.seen(shown, camera.eye)),
+        "triangles": lambda: triangles.seen(shown, camera.eye),
         "lookup and exposure": lambda: shown.field(0, points, facing),
         "tone": lambda: srgb_curve(colors),
         "draw": lambda: drawn(plain),
         "isosurface": lambda: isosurface(field.volume, ISOVALUE, capped=True),
-        "local frame": lambda: drawn(meshes.triangles(replace(shown, local=True), camera.eye)),
+        "local frame": lambda: drawn(triangles.seen(replace(shown, local=True), camera.eye)),
     }
     if importlib.util.find_spec("vtk"):
         parts["VTK flying edges"] = lambda: flying_edges(field.volume.values)
