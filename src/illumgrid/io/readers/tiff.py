@@ -24,6 +24,10 @@ BOUNDED = {1: 1, 5: 4096, 8: 1032, 32773: 128, 32946: 1032}
 """Times its size that data of these codecs unpack to at most."""
 
 
+LARGEST_TILE = 1 << 26
+"""Bytes of a tile that may be larger than its page."""
+
+
 def read(source: Source, wanted: Wanted) -> Stored:
     """Read one volume of a TIFF: series (array), channel and time step are chosen by the user."""
     with _opened_tiff(source) as (tiff, reports):
@@ -182,6 +186,11 @@ def check_pages(tiff: Any, series: Any) -> None:
     if first.compression not in CODECS:
         raise BadInput(
             f"packed by {first.compression!r}; expected none, LZW, deflate, zstd or JPEG; save it as one of those"
+        )
+    tile = math.prod(first.chunks) * first.dtype.itemsize if first.is_tiled else 0
+    if tile > max(LARGEST_TILE, 4 * first.nbytes):
+        raise BadInput(
+            f"its tiles promise {tile} bytes each, its pages {first.nbytes}; expected tiles of a page; {AGAIN}"
         )
     held, size, form = 0, tiff.filehandle.size, tiff.tiff
     for page in pages:
