@@ -8,7 +8,7 @@ QUICK = ["--range", "0.3", "0.9", "--grid", "8", "--paths", "2", "--bounces", "1
 
 
 @pytest.mark.parametrize("sampler", ["direct", "uniform", "adaptive"])
-@pytest.mark.parametrize("interpolator", ["nearest", "splat", "rbf"])
+@pytest.mark.parametrize("interpolator", ["nearest", "bilateral", "splat", "rbf"])
 def test_samplers_and_interpolators_go_together(call, tmp_path, sampler, interpolator):
     call("run", "v.npy", *QUICK, "--sampler", sampler, "--interpolator", interpolator, "--isovalues", "3", "-o", "out")
     made = json.loads((tmp_path / "out" / "run.json").read_text("utf-8"))["recipe"]

@@ -11,8 +11,9 @@ from scipy.stats import chi2
 from illumgrid.field.scene import Field, Scene, level_table
 from illumgrid.field.volume import Volume, interpolate, world_to_index
 from illumgrid.grid import GridSpec
+from illumgrid.grid.nodes import reachable
 from illumgrid.samplers import direct
-from illumgrid.samplers.direct import Direct, reachable
+from illumgrid.samplers.direct import Direct
 from illumgrid.samplers.uniform import Uniform
 from illumgrid.stages import Sampler, on_level_sets
 from illumgrid.transport.samples import join_queries

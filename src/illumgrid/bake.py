@@ -14,7 +14,8 @@ from illumgrid.field.scene import Levels, Quad, Scene
 from illumgrid.field.volume import interpolate, world_to_index
 from illumgrid.grid import GridSpec, IlluminationGrid, Nodes, WallTexture, channels_of, fill_holes
 from illumgrid.grid.channels import Channels
-from illumgrid.samplers.direct import Direct, reachable
+from illumgrid.grid.nodes import reachable
+from illumgrid.samplers.direct import Direct
 from illumgrid.stages import Backend, Interpolator, Sampler
 from illumgrid.transport.samples import Queries, Samples, combine, join_queries, join_samples
 from illumgrid.transport.stages import fill_nodes

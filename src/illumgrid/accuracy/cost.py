@@ -10,8 +10,9 @@ import numpy as np
 
 from illumgrid.field.scene import Scene
 from illumgrid.grid import GridSpec, Nodes
+from illumgrid.grid.nodes import reachable
 from illumgrid.interpolators.nearest import Nearest
-from illumgrid.samplers.direct import at_nodes, reachable
+from illumgrid.samplers.direct import at_nodes
 from illumgrid.transport.tracer import Tracer
 
 

@@ -154,7 +154,7 @@ def run(
         ),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, max=2**64 - 1, metavar="N", help="Equal seeds give equal light.")] = 0,
-    interpolator: Annotated[str, typer.Option(help="From samples to nodes: nearest, splat, rbf.")] = "nearest",
+    interpolator: Annotated[str, typer.Option(help="nearest, bilateral, splat or rbf.")] = "nearest",
     grid: Annotated[
         int | None,
         typer.Option(min=2, metavar="N", help="Nodes along the longest axis. [default: 1.2 a voxel, at most 150]"),

@@ -133,25 +133,33 @@ class IlluminationGrid:
         mean = float(self.values[known].mean()) if known.any() else 0.0
         return float(np.sqrt(np.square(self.error[known], dtype=float).mean())) / mean if mean > 0 else None
 
+    @cached_property
+    def _alone(self) -> NDArray[np.bool_]:
+        """Nodes (nx, ny, nz) that rest on one sample, which no other node has, and holes."""
+        return (self.support <= 1) | ~np.isfinite(self.error)
+
     def _bend(self, axis: int, step: int) -> Floats:
         """Mean square over RGB of second differences along an axis, `step` nodes apart, less the noise in them."""
         shown = self.light if self.channels == GREY else self.values
         light, error = (np.moveaxis(a, axis, 0) for a in (shown, self.error))
         after, here, before = slice(2 * step, None), slice(step, -step), slice(None, -2 * step)
         square = np.square(light[after] - 2 * light[here] + light[before], dtype=float).mean(axis=-1)
-        noise = np.square(error, dtype=float)  # infinite at holes
+        # Infinite at holes. Noise that neighbours share, as they rest on the same samples, cancels in the differences.
+        noise = np.where(np.moveaxis(self._alone, axis, 0), np.square(error, dtype=float), 0.0)
         return np.moveaxis(square - (noise[after] + 4 * noise[here] + noise[before]), 0, axis)
 
     @cached_property
     def bar(self) -> NDArray[np.float32]:
         """Standard error (nx, ny, nz) of a lookup near each node: noise and interpolation; infinite without support.
 
-        Noise: of the nodes' variance a trilinear lookup keeps Σ w² of its weights w, 8/27 in the mean over a cell.
+        Noise: of the variance of nodes with a sample each a trilinear lookup keeps Σ w² of its weights w, 8/27 in the
+        mean over a cell; nodes that rest on several samples share them with their neighbours, and it keeps all.
         Interpolation: between nodes a straight line is off by at most an eighth of the second difference (h²/8 times
         the largest second derivative), which is taken along each axis from the values themselves, less their noise.
         """
         known = (self.support > 0) & np.isfinite(self.error)
-        square = np.where(known, 8 / 27 * np.square(self.error, dtype=float), np.inf)
+        kept = np.where(self._alone, 8 / 27, 1.0)
+        square = np.where(known, kept * np.square(self.error, where=known, out=np.zeros(known.shape)), np.inf)
         for axis in range(3):
             if self.spec.shape[axis] > 2:  # two nodes show no curvature
                 bend = np.nan_to_num(self._bend(axis, 1), neginf=0.0)  # next to a hole only the other axes count

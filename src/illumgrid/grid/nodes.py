@@ -15,6 +15,39 @@ from illumgrid.grid.illumination import IlluminationGrid
 from illumgrid.grid.lookup import fill_holes
 
 
+def _any_corner(voxels: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Cells with a marked voxel among their 8 corners."""
+    for axis in range(3):
+        line = np.moveaxis(voxels, axis, 0)
+        voxels = np.moveaxis(line[1:] | line[:-1], 0, axis)
+    return voxels
+
+
+def crossed_cells(field: Field) -> NDArray[np.bool_]:
+    """Voxel cells (nx - 1, ny - 1, nz - 1) through which some level set of the field's range passes."""
+    values, (low, high) = field.volume.values, field.stored_range
+    return _any_corner(values >= low) & _any_corner(values <= high)
+
+
+def reachable(field: Field, spec: GridSpec) -> NDArray[np.int64]:
+    """Flat numbers of the nodes that a lookup on some isosurface of the field's range can read.
+
+    These are the corners of all grid cells that overlap a voxel cell crossed by a level set of the range.
+    """
+    crossed = crossed_cells(field)
+    for axis in range(3):
+        line = np.moveaxis(crossed, axis, 0)
+        voxel_cells, grid_cells = len(line), spec.shape[axis] - 1
+        first = np.arange(grid_cells) * voxel_cells // grid_cells
+        last = -(-(np.arange(grid_cells) + 1) * voxel_cells // grid_cells)
+        touched = [line[a:b].any(axis=0) for a, b in zip(first, last)]
+        crossed = np.moveaxis(np.stack(touched), 0, axis)
+    nodes = np.zeros(spec.shape, bool)
+    for corner in np.ndindex(2, 2, 2):
+        nodes[tuple(slice(c, c + n) for c, n in zip(corner, crossed.shape))] |= crossed
+    return np.flatnonzero(nodes)
+
+
 @dataclass(frozen=True, eq=False)
 class Nodes:
     """Nodes of a grid over a field.

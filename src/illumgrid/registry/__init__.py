@@ -30,6 +30,7 @@ OWN = (
     "backends.embree",
     "backends.reference",
     "interpolators.nearest",
+    "interpolators.bilateral",
     "interpolators.splat",
     "interpolators.rbf",
 )

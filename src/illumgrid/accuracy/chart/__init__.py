@@ -18,7 +18,8 @@ from illumgrid.constants import PATHS
 from illumgrid.errors import BadInput
 from illumgrid.field.lattice import specs_over
 from illumgrid.field.scene import Scene
-from illumgrid.samplers.direct import Direct, reachable
+from illumgrid.grid.nodes import reachable
+from illumgrid.samplers.direct import Direct
 from illumgrid.transport.samples import Queries
 from illumgrid.transport.tracer import Tracer, prepare
 

@@ -1,0 +1,239 @@
+"""Light read by place, level and normal, compiled: locally weighted regression over the samples near a point.
+
+Serial, no state, the GIL released; threads are the caller's. Index coordinates u count spacings of the lattice that was
+lit, x voxels. The constants are in spacings or pure numbers, so that the result does not depend on units.
+"""
+
+import numba
+import numpy as np
+
+jit = numba.njit(cache=True, nogil=True, error_model="numpy")
+inlined = numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+
+LEVEL = 0.2  # node spacings between level sets, one standard deviation of the weight
+TURN = 0.2  # of 1 - n·n': the weight falls to 1/e there, at 37 degrees, and to e^-10 for opposite normals
+RIDGE = 0.1  # of the weights' sum, in squared spacings: what holds back slopes that the samples do not tell
+NEGLIGIBLE = 14.0  # a weight e^-14 of the largest is none
+NEAREST = 0.499  # spacings within which a hole of the lit lattice makes a hole; halfway the others decide
+MOST = 512  # samples that one point reads, at most
+
+
+@inlined
+def outward(values, x, y, z, sign, spacing):
+    """Value of the trilinear field at voxel coordinates, and its gradient by interpolated central differences.
+
+    Per world unit along the volume's axes, times `sign`; where the differences cancel, that of the trilinear cell.
+    """
+    nx, ny, nz = values.shape
+    a, b, c = min(max(int(x), 0), nx - 2), min(max(int(y), 0), ny - 2), min(max(int(z), 0), nz - 2)
+    u, v, w = min(max(x - a, 0.0), 1.0), min(max(y - b, 0.0), 1.0), min(max(z - c, 0.0), 1.0)
+    h, gx, gy, gz, cx, cy, cz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for corner in range(8):
+        i, j, k = corner >> 2, (corner >> 1) & 1, corner & 1
+        p, q, r = (u if i else 1.0 - u), (v if j else 1.0 - v), (w if k else 1.0 - w)
+        here = np.float64(values[a + i, b + j, c + k])
+        h += p * q * r * here
+        cx += (q * r if i else -q * r) * here
+        cy += (p * r if j else -p * r) * here
+        cz += (p * q if k else -p * q) * here
+        low, high = max(a + i - 1, 0), min(a + i + 1, nx - 1)
+        gx += p * q * r * (np.float64(values[high, b + j, c + k]) - values[low, b + j, c + k]) / (high - low)
+        low, high = max(b + j - 1, 0), min(b + j + 1, ny - 1)
+        gy += p * q * r * (np.float64(values[a + i, high, c + k]) - values[a + i, low, c + k]) / (high - low)
+        low, high = max(c + k - 1, 0), min(c + k + 1, nz - 1)
+        gz += p * q * r * (np.float64(values[a + i, b + j, high]) - values[a + i, b + j, low]) / (high - low)
+    if gx == 0.0 and gy == 0.0 and gz == 0.0:
+        gx, gy, gz = cx, cy, cz
+    return h, sign * gx / spacing[0], sign * gy / spacing[1], sign * gz / spacing[2]
+
+
+@inlined
+def unit(gx, gy, gz):
+    """Unit vector against a gradient, and its length; scaled first, since the square of a tiny slope underflows."""
+    largest = max(abs(gx), abs(gy), abs(gz))
+    if not largest > 0.0:
+        return 0.0, 0.0, 0.0, 0.0
+    gx, gy, gz = gx / largest, gy / largest, gz / largest
+    length = np.sqrt(gx * gx + gy * gy + gz * gz)
+    return -gx / length, -gy / length, -gz / length, length * largest
+
+
+@jit
+def slopes(values, spacing, nodes, x, out):
+    """Size (n,) of the gradient at voxel coordinates x (n, 3), per step of the lattice of spacing `nodes`."""
+    for i in range(len(x)):
+        _, gx, gy, gz = outward(values, x[i, 0], x[i, 1], x[i, 2], 1.0, spacing)
+        _, _, _, out[i] = unit(gx * nodes[0], gy * nodes[1], gz * nodes[2])
+
+
+@inlined
+def hat(d):
+    """Weight of a sample d spacings away along an axis: smooth, and 0 from two spacings on."""
+    t = 1.0 - 0.25 * d * d
+    return t * t if t > 0.0 else 0.0
+
+
+@jit
+def estimate(start, place, light, variance, shape, u, level, normal, log, weights, near, system, right, found):
+    """Light at index u of the lit lattice, for a surface of this level and normal, from the samples around it.
+
+    Samples lie in bins, one for each node of the lattice, `start` (nodes + 1,) in order. place (m, 8): index
+    coordinates, level, normal, slope. The weights are those of a joint bilateral filter,
+
+        w = hat(dx) hat(dy) hat(dz) exp(-(δ/LEVEL)²/2) exp(-(1 - n·n')/TURN),   δ = |c' - c| / |∇h'|,
+
+    the value is that of the linear function of position which fits best (moving least squares, a ridge on its slope),
+    held within the range of the samples. Fills found (C,); returns variance and number of samples, 0 if none is near.
+
+    The variance is Σ a² σ² of the samples' noise, a their weights in the fit, and (1 + Σ a²) s², s² being by how much
+    more than noise the samples around scatter about the fit: the light at the point does so too.
+    """
+    low0, high0 = max(int(np.ceil(u[0] - 2.5)), 0), min(int(np.floor(u[0] + 2.5)), shape[0] - 1)
+    low1, high1 = max(int(np.ceil(u[1] - 2.5)), 0), min(int(np.floor(u[1] + 2.5)), shape[1] - 1)
+    low2, high2 = max(int(np.ceil(u[2] - 2.5)), 0), min(int(np.floor(u[2] + 2.5)), shape[2] - 1)
+    count, top, channels = 0, -np.inf, light.shape[1]
+    for a in range(low0, high0 + 1):
+        for b in range(low1, high1 + 1):
+            row = (a * shape[1] + b) * shape[2]
+            for i in range(start[row + low2], start[row + high2 + 1]):
+                hats = hat(place[i, 0] - u[0]) * hat(place[i, 1] - u[1]) * hat(place[i, 2] - u[2])
+                if hats <= 1e-12 or count == MOST:
+                    continue
+                delta, slope = abs(place[i, 3] - level), place[i, 7]
+                if delta >= 1e6 * slope:
+                    if delta > 0.0:
+                        continue
+                    slope = 1.0
+                delta /= LEVEL * slope
+                cosine = place[i, 4] * normal[0] + place[i, 5] * normal[1] + place[i, 6] * normal[2]
+                exponent = -0.5 * delta * delta - (1.0 - cosine) / TURN
+                if exponent < top - NEGLIGIBLE:
+                    continue
+                log[count], weights[count], near[count] = exponent, hats, i
+                top = max(top, exponent)
+                count += 1
+    if count == 0:
+        return np.inf, 0.0
+    total, squares, noise = 0.0, 0.0, 0.0
+    for r in range(4):
+        for s in range(4):
+            system[r, s] = 0.0
+        for k in range(channels):
+            right[r, k] = 0.0
+    kept = 0
+    for j in range(count):
+        if log[j] < top - NEGLIGIBLE:
+            continue
+        i, weight = near[j], weights[j] * np.exp(log[j] - top)
+        weights[kept], near[kept] = weight, i
+        kept += 1
+        x, y, z = place[i, 0] - u[0], place[i, 1] - u[1], place[i, 2] - u[2]
+        total += weight
+        squares += weight * weight
+        noise += weight * variance[i]
+        system[1, 0] += weight * x
+        system[2, 0] += weight * y
+        system[3, 0] += weight * z
+        system[1, 1] += weight * x * x
+        system[2, 1] += weight * x * y
+        system[3, 1] += weight * x * z
+        system[2, 2] += weight * y * y
+        system[3, 2] += weight * y * z
+        system[3, 3] += weight * z * z
+        for k in range(channels):
+            value = weight * light[i, k]
+            right[0, k] += value
+            right[1, k] += value * x
+            right[2, k] += value * y
+            right[3, k] += value * z
+    system[0, 0] = total
+    for r in range(1, 4):
+        system[r, r] += RIDGE * total
+    for j in range(4):  # Cholesky's factor, in place
+        for k in range(j):
+            system[j, j] -= system[j, k] * system[j, k]
+        system[j, j] = np.sqrt(max(system[j, j], 1e-12 * total))
+        for i in range(j + 1, 4):
+            for k in range(j):
+                system[i, j] -= system[i, k] * system[j, k]
+            system[i, j] /= system[j, j]
+    column = right.shape[1] - 1  # the last column asks for the weights themselves
+    right[0, column], right[1, column], right[2, column], right[3, column] = 1.0, 0.0, 0.0, 0.0
+    for k in range(column + 1):
+        for i in range(4):
+            for j in range(i):
+                right[i, k] -= system[i, j] * right[j, k]
+            right[i, k] /= system[i, i]
+        for i in range(3, -1, -1):
+            for j in range(i + 1, 4):
+                right[i, k] -= system[j, i] * right[j, k]
+            right[i, k] /= system[i, i]
+    scatter, own, spread = 0.0, 0.0, 0.0
+    for j in range(kept):
+        i = near[j]
+        x, y, z = place[i, 0] - u[0], place[i, 1] - u[1], place[i, 2] - u[2]
+        share = weights[j] * (right[0, column] + right[1, column] * x + right[2, column] * y + right[3, column] * z)
+        own += share * share * variance[i]
+        spread += share * share
+        off = 0.0
+        for k in range(channels):
+            miss = light[i, k] - right[0, k] - right[1, k] * x - right[2, k] * y - right[3, k] * z
+            off += miss * miss
+        scatter += weights[j] * off / channels
+    for k in range(channels):
+        lowest, highest = np.inf, -np.inf
+        for j in range(kept):
+            lowest, highest = min(lowest, light[near[j], k]), max(highest, light[near[j], k])
+        found[k] = min(max(right[0, k], lowest), highest)
+    if not noise < np.inf:
+        return np.inf, 1.0 / spread
+    alike = total * total / squares
+    misfit = max(0.0, scatter / total * alike / max(alike - 1.0, 0.5) - noise / total)
+    return own + misfit * (1.0 + spread), 1.0 / spread
+
+
+@jit
+def fill(
+    values, spacing, sign, ends, scale, shift, start, place, light, variance, dark, shape, ratio, x, out, error, support
+):
+    """Fill light (n, C), error and support (n,) at nodes in voxel coordinates x (n, 3).
+
+    A node whose value lies beyond the `ends` of the range reads at the nearest end, where the gradient leads to it. u
+    is x times `ratio`; `dark` marks the nodes of the lit lattice that are holes.
+    """
+    log, weights, near = np.empty(MOST), np.empty(MOST), np.empty(MOST, np.int64)
+    system, right = np.empty((4, 4)), np.empty((4, light.shape[1] + 1))
+    found = np.zeros(light.shape[1])
+    for i in range(len(x)):
+        a, b, c = x[i, 0], x[i, 1], x[i, 2]
+        node = int(np.round(a * ratio[0])), int(np.round(b * ratio[1])), int(np.round(c * ratio[2]))
+        aside = max(abs(a * ratio[0] - node[0]), abs(b * ratio[1] - node[1]), abs(c * ratio[2] - node[2]))
+        if aside < NEAREST and dark[(node[0] * shape[1] + node[1]) * shape[2] + node[2]]:
+            continue
+        h, gx, gy, gz = outward(values, a, b, c, sign, spacing)
+        level = min(max(h, ends[0]), ends[1])
+        for _ in range(4):
+            steep = gx * gx * spacing[0] ** 2 + gy * gy * spacing[1] ** 2 + gz * gz * spacing[2] ** 2
+            if h == level or not steep > 0.0:
+                break
+            far = sign * (level - h) / steep
+            sx, sy, sz = far * gx * spacing[0], far * gy * spacing[1], far * gz * spacing[2]
+            largest = max(abs(sx), abs(sy), abs(sz))
+            if not largest < 1e9:
+                break
+            hold = min(1.0, 0.5 / largest) if largest > 0.0 else 1.0
+            a = min(max(a + hold * sx, 0.0), values.shape[0] - 1.0)
+            b = min(max(b + hold * sy, 0.0), values.shape[1] - 1.0)
+            c = min(max(c + hold * sz, 0.0), values.shape[2] - 1.0)
+            h, gx, gy, gz = outward(values, a, b, c, sign, spacing)
+        nx, ny, nz, steep = unit(gx, gy, gz)
+        if steep == 0.0:
+            continue
+        square, count = estimate(
+            start, place, light, variance, shape, (a * ratio[0], b * ratio[1], c * ratio[2]),
+            (level - shift) * scale, (nx, ny, nz), log, weights, near, system, right, found,
+        )  # fmt: skip
+        if count > 0.0:
+            error[i], support[i] = np.sqrt(square), count
+            for k in range(light.shape[1]):
+                out[i, k] = found[k]
