@@ -4,11 +4,12 @@ Serial, no state, the GIL released; threads are the caller's. Index coordinates 
 lit, x voxels. The constants are in spacings or pure numbers, so that the result does not depend on units.
 """
 
-import numba
 import numpy as np
 
-jit = numba.njit(cache=True, nogil=True, error_model="numpy")
-inlined = numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+from illumgrid.compiled import njit
+
+jit = njit()
+inlined = njit(_nrt=False, forceinline=True)
 
 LEVEL = 0.2  # node spacings between level sets, one standard deviation of the weight
 TURN = 0.2  # of 1 - n·n': the weight falls to 1/e there, at 37 degrees, and to e^-10 for opposite normals
