@@ -1,5 +1,6 @@
 """The command line: one file per command; only here does the package print."""
 
+import io
 import sys
 from collections.abc import Callable
 from typing import Annotated, Any
@@ -47,6 +48,9 @@ def root(
 
 def main() -> None:
     """Run the command line: exit 2 and one sentence on bad input, 130 on Ctrl-C."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # what the terminal or the pipe has no sign for is written as \\u00fc
+            stream.reconfigure(errors="backslashreplace")
     sys.exit(guarded(lambda: app(standalone_mode=False)))
 
 

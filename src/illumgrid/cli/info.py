@@ -1,5 +1,6 @@
 """``illumgrid info``: the content of a volume or a finished run."""
 
+import sys
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -13,6 +14,8 @@ if TYPE_CHECKING:
     from illumgrid.grid import WallTexture
 
 BLOCKS = " ▁▂▃▄▅▆▇█"
+PLAIN = " .:-=+*#@"
+"""Where the terminal or the pipe has no block characters."""
 
 
 def histogram_line(volume: "Volume", width: int = 64) -> str:
@@ -22,7 +25,12 @@ def histogram_line(volume: "Volume", width: int = 64) -> str:
     finite = volume.values[np.isfinite(volume.values)]
     counts, _ = np.histogram(finite, width, (np.float64(finite.min()), np.float64(finite.max())))
     height = np.log1p(counts) / max(np.log1p(counts.max()), 1e-9)
-    return "".join(BLOCKS[int(np.ceil(h * 8))] for h in height)
+    marks = BLOCKS
+    try:
+        BLOCKS.encode(sys.stdout.encoding or "utf-8")
+    except (UnicodeEncodeError, LookupError):
+        marks = PLAIN
+    return "".join(marks[int(np.ceil(h * 8))] for h in height)
 
 
 def info(

@@ -54,8 +54,10 @@ UNREADABLE = (
 def volume_name(path: str | os.PathLike[str]) -> str:
     """Name of a volume as shown to users: the file's name without its known suffixes, or the folder's name."""
     file = Path(os.path.abspath(path))
+    # Names on the disk are bytes: what is no UTF-8 in them cannot be printed, nor written into other files.
     if file.is_dir():
-        return file.name
+        return os.fsencode(file.name).decode("utf-8", "replace")
+    file = Path(os.fsencode(file.name).decode("utf-8", "replace"))
     bare = Path(file.stem) if file.suffix.lower() == ".gz" else file
     bare = bare if bare.suffix.lower() not in SUFFIXES else Path(bare.stem)
     return bare.stem if bare.suffix.lower() == ".ome" else bare.name
