@@ -40,7 +40,7 @@ Cast = Callable[[int, Floats, Floats], tuple[Floats, Ints]]
 
 @dataclass(frozen=True)
 class Casting:
-    """Rays that are cast at the meshes of one row of levels, by whoever can: see `mesh.cast.mesh_from`.
+    """Rays cast at the meshes of one row of levels by the function `cast`: see `mesh.cast.mesh_from`.
 
     Parameters
     ----------

@@ -32,7 +32,7 @@ def cached(*sources: ModuleType, **options: Any) -> Callable[[Any], Any]:
     Parameters
     ----------
     *sources : module
-        All whose functions end up in the compiled code, apart from the function's own module and what is frozen.
+        All whose functions end up in the compiled code, except the function's own module and what is frozen.
     **options
         More for Numba.
 
@@ -247,7 +247,7 @@ compiles(lowest, types.intp, types.intp)(lambda builder, m: builder.cttz(m, ir.C
 
 
 def address(array: Any) -> Any:
-    """Where an array begins, for load and store; whoever calls keeps the array alive."""
+    """Where an array begins, for load and store; the caller keeps the array alive."""
     return array
 
 

@@ -59,7 +59,7 @@ def _aligned(bricks: int, size: int) -> Bytes:
 def _steps(values: NDArray[np.float32]) -> NDArray[np.float32]:
     """Steps for the ranks: half of them equal shares of the voxels, half of them equal steps of the value.
 
-    They lie an ulp above values: of data with few distinct values the ranks tell every level apart.
+    They lie an ulp above values: for data with few distinct values the ranks distinguish every level.
     """
     flat = values.reshape(-1)
     found = np.unique(flat[:: max(1, flat.size >> 16)])

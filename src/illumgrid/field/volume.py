@@ -266,7 +266,7 @@ def cell_gradient(volume: Volume, index: Floats) -> Floats:
         value = volume.values[tuple((cell + corner).T)]
         for axis in range(3):
             sign = 1.0 if corner[axis] else -1.0
-            result[:, axis] += sign * np.delete(weight, axis, axis=1).prod(axis=1) * value
+            result[:, axis] += sign * (weight[:, axis - 1] * weight[:, axis - 2]) * value
     return result / volume.spacing
 
 
