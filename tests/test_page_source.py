@@ -163,6 +163,17 @@ def test_what_is_too_large_is_reduced_and_told(monkeypatch):
     assert "9\u2009×\u20099\u2009×\u20099 to 5\u2009×\u20095\u2009×\u20095 nodes" in scene["notes"][1]
 
 
+def test_a_side_longer_than_a_texture_is_reduced():
+    long = sampled(lambda x: x @ (1.0, 2.0, 3.0), (5000, 4, 3), (5, 6, 7), (1, 2, 1), MIRRORED)
+    small = reduced(long, most=2**25)
+    assert small.shape == (1667, 4, 3)
+    where = index_to_world(small, np.array([[700.0, 2.0, 1.0]]))[0]
+    assert small.values[700, 2, 1] == pytest.approx(where @ (1.0, 2.0, 3.0), rel=1e-5)
+    grid = lit(sky(ball(20)), nodes=9).grids[0]
+    spec = replace(grid.spec, shape=(3001, 2, 2))
+    assert max(thinned(grid.onto(spec), most=2**22).spec.shape) <= 2048
+
+
 @pytest.mark.plain
 @pytest.mark.parametrize("nodes", [9, 10, 11, 12])
 def test_thinned_light_reaches_from_the_first_node_to_the_last_and_is_what_the_grid_answers(nodes):

@@ -8,6 +8,8 @@ from numpy.typing import NDArray
 from illumgrid.field.volume import Volume, index_to_world
 from illumgrid.grid import GridSpec, IlluminationGrid
 
+MOST_SIDE = 2048
+"""Voxels along one side of a texture: what graphics drivers of phones and laptops take."""
 HOLE = -1.0  # in place of an error: no light of its own, or no error known
 _STEPS = 65535
 _FINE = 4096  # steps that the swept range must span: else values far outside it are clamped
@@ -27,24 +29,28 @@ class Bytes:
         return self.length - len(part)
 
 
-def _factor(shape: tuple[int, ...], most: int) -> int:
-    """The smallest factor by which all axes must shrink to leave at most `most` points."""
+def _factors(shape: tuple[int, ...], most: int) -> NDArray[np.int64]:
+    """Factors (3,) by which axes must shrink to leave at most `most` points, and at most `MOST_SIDE` along each."""
+    sides = np.array(shape)
+    long = -(-sides // MOST_SIDE)
     factor = 1
-    while np.prod([-(-n // factor) for n in shape]) > most:
+    while np.prod(-(-sides // np.maximum(long, factor)), dtype=float) > most:
         factor += 1
-    return factor
+    factors: NDArray[np.int64] = np.minimum(np.maximum(long, factor), np.maximum(sides // 2, 1))
+    return factors
 
 
 def reduced(volume: Volume, most: int) -> Volume:
-    """Means over blocks of voxels, the same number along each axis, until at most `most` remain."""
-    factor = _factor(volume.shape, most)
-    if factor == 1:
+    """Means over blocks of voxels, until at most `most` remain, and at most `MOST_SIDE` along each axis."""
+    factors = _factors(volume.shape, most)
+    if (factors == 1).all():
         return volume
-    padded = np.pad(volume.values, [(0, -n % factor) for n in volume.shape], mode="edge")
-    split = padded.reshape([k for n in padded.shape for k in (n // factor, factor)])
-    origin = index_to_world(volume, np.full((1, 3), (factor - 1) / 2))[0]
+    padded = np.pad(volume.values, [(0, -n % int(f)) for n, f in zip(volume.shape, factors)], mode="edge")
+    split = padded.reshape([int(k) for n, f in zip(padded.shape, factors) for k in (n // f, f)])
+    origin = index_to_world(volume, (factors[None] - 1) / 2)[0]
     means = split.mean(axis=(1, 3, 5))
-    return Volume(means, origin, volume.spacing * factor, volume.direction, volume.slope, volume.intercept, volume.unit)
+    spacing = volume.spacing * factors
+    return Volume(means, origin, spacing, volume.direction, volume.slope, volume.intercept, volume.unit)
 
 
 def thinned(grid: IlluminationGrid, most: int) -> IlluminationGrid:
@@ -52,11 +58,11 @@ def thinned(grid: IlluminationGrid, most: int) -> IlluminationGrid:
 
     Error and support are those of the nearest node.
     """
-    factor = _factor(grid.spec.shape, most)
-    if factor == 1:
+    factors = _factors(grid.spec.shape, most)
+    if (factors == 1).all():
         return grid
     old = np.array(grid.spec.shape) - 1
-    new = np.maximum(1, -(-old // factor))
+    new = np.maximum(1, -(-old // factors))
     shape = (int(new[0]) + 1, int(new[1]) + 1, int(new[2]) + 1)
     spec = GridSpec(shape, grid.spec.origin, grid.spec.spacing * old / new, grid.spec.direction)
     return grid.onto(spec)
