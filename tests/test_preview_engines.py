@@ -3,6 +3,8 @@
 import os
 import subprocess
 import sys
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import cache
 
@@ -197,6 +199,8 @@ def test_after_egl_failed_osmesa_draws_in_the_same_process(tmp_path, way):
 
 ASK = """
 import sys
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from illumgrid import cli
 sys.argv = ["illumgrid", "preview", "anywhere", "-o", "x.png", "--engine", "{platform}"]
 cli.main()
@@ -222,6 +226,17 @@ def test_another_opengl_in_the_process_is_left_alone(monkeypatch):
     monkeypatch.setattr(gl, "_opened", {"egl": None})
     assert "one OpenGL" in gl.unavailable("osmesa")
     assert choose_engine("auto") == ("egl", "OpenGL is available through EGL")
+
+
+def test_another_thread_and_a_fork_draw_by_the_software_engine(monkeypatch):
+    monkeypatch.setattr(gl, "_opened", {"egl": None})
+    monkeypatch.setattr(gl, "_home", [(os.getpid(), threading.get_ident())])
+    assert choose_engine("auto")[0] == "egl"
+    with ThreadPoolExecutor() as pool:
+        assert pool.submit(choose_engine, "auto").result() == ("software", "OpenGL was opened in another thread")
+    monkeypatch.setattr(gl, "_home", [(os.getpid() + 1, threading.get_ident())])
+    with pytest.raises(BadInput, match=r"opened in another process, .* draw there or choose"):
+        choose_engine("egl")
 
 
 def test_software_is_asked_for_without_a_look_at_opengl(monkeypatch):

@@ -25,7 +25,14 @@ def choose_engine(name: str) -> tuple[str, str]:
             return platform, "as asked" if name == platform else f"OpenGL is available through {platform.upper()}"
         reasons.append(f"no {platform.upper()} ({reason})")
     if name == "auto":
+        if gl.elsewhere():
+            return "software", f"{gl.elsewhere()}"
         return "software", f"{' and '.join(reasons)}; apt-get install {' '.join(gl.PACKAGES.values())} brings OpenGL"
+    if gl.elsewhere():
+        raise BadInput(
+            f"the engine {name} was asked for, but {gl.elsewhere()}; expected all pictures in one thread; draw there "
+            "or choose --engine software"
+        )
     raise BadInput(
         f"the engine {name} was asked for, but there is {reasons[0]}; install it (apt-get install {gl.PACKAGES[name]} "
         "on Debian and Ubuntu) or choose --engine software"

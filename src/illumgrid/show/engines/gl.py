@@ -8,6 +8,7 @@ deleting one renderer destroys the context of every other.
 import gc
 import os
 import sys
+import threading
 import types
 import warnings
 from typing import Any
@@ -27,16 +28,27 @@ PACKAGES = {"egl": "libegl1 libgl1", "osmesa": "libosmesa6"}
 """Platforms, best first, and the Debian packages that bring their libraries."""
 
 _opened: dict[str, Any] = {}  # at most one: platform to renderer
+_home: list[tuple[int, int]] = []  # process and thread whose context it is: in another, drawing fails or hangs
 _missing: dict[str, str] = {}  # platform to why it cannot be used here
 
 
 def unavailable(platform: str) -> str | None:
-    """Why this platform cannot draw in this process, in some words; None if it can."""
+    """Why this platform cannot draw in this process and thread, in some words; None if it can."""
+    if reason := elsewhere():
+        return reason
     if platform not in _opened and platform not in _missing:
         reason = _open(platform)
         if reason is not None:
             _missing[platform] = reason
     return None if platform in _opened else _missing[platform]
+
+
+def elsewhere() -> str | None:
+    """Where OpenGL was opened, if that is not in this thread of this process."""
+    if not (_opened and _home) or _home == [(os.getpid(), threading.get_ident())]:
+        return None
+    where = "thread" if _home[0][0] == os.getpid() else "process, from which this one was forked"
+    return f"OpenGL was opened in another {where}"
 
 
 def _open(platform: str) -> str | None:
@@ -52,6 +64,7 @@ def _open(platform: str) -> str | None:
         renderer = pyrender.OffscreenRenderer(64, 64)
         renderer._platform.supports_framebuffers = lambda: True  # else OSMesa keeps the size of the first picture
         _opened[platform] = pyrender, renderer
+        _home[:] = [(os.getpid(), threading.get_ident())]
     except Exception as error:  # ImportError, AttributeError, EGLError, AssertionError...
         reason = " ".join(f"{type(error).__name__} {error}".split())[:90]
     finally:
