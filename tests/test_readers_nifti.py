@@ -133,3 +133,13 @@ def test_freesurfer(tmp_path, ending):
     lies_as_nibabel_says(tmp_path / f"a.{ending}", read_volume(tmp_path / f"a.{ending}"))
     nibabel.save(MGHImage(values("float32", (5, 6, 7, 2)), AFFINE), tmp_path / f"a.{ending}")
     refused(tmp_path / f"a.{ending}", "holds 2 time steps")
+
+
+def test_what_nibabel_mends_is_told_and_stays_off_the_terminal(tmp_path, capfd):
+    file = saved(tmp_path / "a.nii", sform=(AFFINE, 1), qform=(None, 0))
+    data = bytearray(file.read_bytes())
+    data[80:84] = np.array(-1.2, "<f4").tobytes()  # pixdim[1]
+    file.write_bytes(data)
+    with pytest.warns(IllumgridWarning, match=r"file: a\.nii: nibabel reports: pixdim\[1,2,3\] should be positive"):
+        read_volume(file)
+    assert capfd.readouterr().err == ""

@@ -30,7 +30,7 @@ def in_solid(field, level, point):
     volume, sign = field.volume, 1.0 if field.inside == "above" else -1.0
     index = (point - volume.origin) @ volume.direction / volume.spacing
     height = map_coordinates(sign * volume.values, index.T, order=1, mode="constant", cval=np.finfo(np.float32).min)
-    return height >= sign * level
+    return height >= sign * volume.to_stored(level)
 
 
 def meets_quad(quad, origin, direction, reach):

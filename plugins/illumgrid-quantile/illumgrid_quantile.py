@@ -23,11 +23,13 @@ class Quantile:
 
     def queries(self, scene, specs, seed):
         """Ask on `count` level sets: see `illumgrid.stages.Sampler`."""
-        low, high = scene.fields[0].range
-        values = scene.fields[0].volume.values
+        field = scene.fields[0]
+        low, high = field.stored_range
+        values = field.volume.values
         swept = values[(values >= low) & (values <= high)]
         share = (np.arange(self.count) + 0.5) / self.count
-        return on_level_sets(scene, np.quantile(swept if swept.size else [low, high], share), seed, specs=specs)
+        levels = field.volume.in_units(np.quantile(swept if swept.size else [low, high], share))
+        return on_level_sets(scene, levels, seed, specs=specs)
 
 
 @hookimpl

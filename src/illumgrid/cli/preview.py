@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from illumgrid.cli.terminal import progress_bars, say
-from illumgrid.errors import BadInput
+from illumgrid.errors import BadInput, shown, shown_range
 
 if TYPE_CHECKING:
     from illumgrid.light import Illumination
@@ -226,7 +226,8 @@ def _note_outside(light: "Illumination", field: str | None, isovalues: list[floa
     low, high = light.scene.fields[light.scene.number_of(field)].range
     for isovalue in isovalues:
         if not low <= isovalue <= high:
-            say(f"note: the isovalue {isovalue:g} lies outside the range {low:g} to {high:g} of the light")
+            said = shown(isovalue, (low, high), 6)
+            say(f"note: the isovalue {said} lies outside the range {shown_range((low, high), 6)} of the light")
 
 
 def _fitted(

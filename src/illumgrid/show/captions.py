@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from illumgrid.errors import shown
 from illumgrid.field.scene import Scene
 from illumgrid.field.volume import Floats, Volume
 from illumgrid.show.camera import Camera
@@ -18,8 +19,8 @@ BAR = 0.2  # of the width: a scale bar is the longest round length up to that
 def isovalues_of(scene: Scene, row: Floats) -> str:
     """Isovalues (F,) as a line of text; with names where there are several."""
     if len(row) == 1:
-        return f"{row[0]:.4g}"
-    return ",  ".join(f"{field.name}: {isovalue:.4g}" for field, isovalue in zip(scene.fields, row))
+        return shown(row[0], scene.fields[0].range)
+    return ",  ".join(f"{field.name}: {shown(isovalue, field.range)}" for field, isovalue in zip(scene.fields, row))
 
 
 def labelled(picture: Picture, text: str) -> Picture:

@@ -2,9 +2,6 @@
 
 import gzip
 import math
-import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import IO, Any
@@ -14,6 +11,7 @@ from numpy.typing import NDArray
 
 from illumgrid.errors import BadInput
 from illumgrid.io.readers.limits import CHUNK, check_axes, check_size
+from illumgrid.io.readers.reports import heard, plain
 from illumgrid.io.readers.source import Source, find_source, finish, opened, read_array
 from illumgrid.io.readers.stored import Note, Stored, Wanted, pick
 
@@ -32,7 +30,7 @@ SAME = 1e-4
 def read(source: Source, wanted: Wanted) -> Stored:
     """Read one volume: its time step (fourth axis) and its channel (fifth) are chosen by the user."""
     head, data = _pair(source)
-    with _muted(), opened(head) as stream:
+    with heard("nibabel.global") as reports, opened(head) as stream:
         header = _header(stream)
         single = data is head
         dtype, shape = header.get_data_dtype(), tuple(int(n) for n in header.get_data_shape())
@@ -52,28 +50,13 @@ def read(source: Source, wanted: Wanted) -> Stored:
         else:
             with opened(data) as other:
                 values, left = _voxels(other, data, header, 0, dtype, shape)
+    more = (*more, *(("file", f"nibabel reports: {plain(text)}") for text in reports[:3]))
     if left:
         more = (*more, ("file", f"{left} bytes follow its data, of which its header says nothing; they are left out"))
     unit = UNITS.get(header.get_xyzt_units()[0]) if hasattr(header, "get_xyzt_units") else None
     values = values.reshape((*shape[:3], *shape[3:5], *(1,) * (5 - len(shape[:5]))), order="F")[..., time, channel]
     spacing = np.array(header.get_zooms()[:3], float)
     return Stored(values, *place, slope, intercept, spacing, unit or "mm", (*notes, *more))
-
-
-@contextmanager
-def _muted() -> Iterator[None]:
-    """What nibabel warns of is said here."""
-    import logging
-
-    reports = logging.getLogger("nibabel.global")
-    level = reports.level
-    reports.setLevel(logging.CRITICAL + 1)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            yield
-    finally:
-        reports.setLevel(level)
 
 
 def _pair(source: Source) -> tuple[Source, Source]:

@@ -1,6 +1,5 @@
 """TIFF stacks by tifffile: series, channels, time steps, many slices in one directory, folders of single slices."""
 
-import logging
 import math
 import re
 from collections.abc import Iterator, Sequence
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 
 from illumgrid.errors import BadInput
 from illumgrid.io.readers.limits import check_axes, check_memory, check_size
+from illumgrid.io.readers.reports import heard, plain
 from illumgrid.io.readers.source import AGAIN, Source, find_source, seekable
 from illumgrid.io.readers.stored import Note, Stored, Wanted, pick
 from illumgrid.io.readers.tiff_spacing import calibrated, channel_names
@@ -88,36 +88,22 @@ def _gaps(files: Sequence[Path]) -> tuple[Note, ...]:
     return (("file", said),)
 
 
-class _Ear(logging.Handler):
-    """Keeps what tifffile reports."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.reports: list[str] = []
-
-    def emit(self, record: logging.LogRecord) -> None:
-        self.reports.append(record.getMessage())
-
-
 @contextmanager
 def _opened_tiff(source: Source) -> Iterator[tuple[Any, list[str]]]:
-    """The file by tifffile, alone (an OME file may name others), and what tifffile reports, in place of stderr."""
+    """The file by tifffile, alone (an OME file may name others), and what tifffile reports."""
     import tifffile
 
-    ear, log = _Ear(), logging.getLogger("tifffile")
-    propagated = log.propagate
-    log.propagate = False
-    log.addHandler(ear)
     try:
         # tifffile reads on where pages or tags are lost, and reports it.
-        with seekable(source) as stream, tifffile.TiffFile(stream, name=source.name, _multifile=False) as tiff:
+        with (
+            heard("tifffile") as reports,
+            seekable(source) as stream,
+            tifffile.TiffFile(stream, name=source.name, _multifile=False) as tiff,
+        ):
             _check_directories(tiff)
-            yield tiff, ear.reports
+            yield tiff, reports
     except tifffile.TiffFileError as problem:
-        raise BadInput(f"is not a whole TIFF ({_plain(str(problem))}); {AGAIN}") from None
-    finally:
-        log.removeHandler(ear)
-        log.propagate = propagated
+        raise BadInput(f"is not a whole TIFF ({plain(str(problem))}); {AGAIN}") from None
 
 
 def _check_directories(tiff: Any) -> None:
@@ -140,23 +126,18 @@ def _check_directories(tiff: Any) -> None:
     file.seek(0)
 
 
-def _plain(text: str) -> str:
-    text = re.sub(r"<[^<>]*> *|@ ?\d+", "", text)
-    return " ".join("".join(c if c.isprintable() else " " for c in text).split())[:150]
-
-
 def _refuse_damaged(reports: list[str]) -> None:
     for text in reports:
         if "circular" in text:
             raise BadInput(f"the pages of this TIFF run in a circle; {AGAIN}")
         if re.search("invalid page offset|invalid value offset|corrupt", text):
-            raise BadInput(f"the TIFF ends before its last page, or is damaged ({_plain(text)}); {AGAIN}")
+            raise BadInput(f"the TIFF ends before its last page, or is damaged ({plain(text)}); {AGAIN}")
 
 
 def _serious(reports: list[str]) -> tuple[Note, ...]:
     """What of tifffile's reports a user should know."""
     serious = [text for text in reports if re.search(r"corrupt|invalid|missing|truncated|fail|raised", text)]
-    return (("file", f"tifffile reports: {_plain(serious[0])}"),) if serious else ()
+    return (("file", f"tifffile reports: {plain(serious[0])}"),) if serious else ()
 
 
 def _series(tiff: Any, wanted: Wanted) -> int:
