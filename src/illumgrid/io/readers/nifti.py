@@ -29,6 +29,15 @@ SAME = 1e-4
 
 def read(source: Source, wanted: Wanted) -> Stored:
     """Read one volume: its time step (fourth axis) and its channel (fifth) are chosen by the user."""
+    from nibabel.spatialimages import HeaderDataError
+
+    try:
+        return _read(source, wanted)
+    except HeaderDataError as problem:
+        raise BadInput(f"its header is not that of a NIfTI file ({problem}); expected a valid one; mend it") from None
+
+
+def _read(source: Source, wanted: Wanted) -> Stored:
     head, data = _pair(source)
     with heard("nibabel.global") as reports, opened(head) as stream:
         header = _header(stream)
@@ -96,11 +105,8 @@ def _header(stream: IO[bytes]) -> Any:
         raise BadInput("ends within its header; expected a whole file; copy or write it again")
     if length == 348 and block[344:348] not in (b"n+1\0", b"ni1\0"):
         kind = nibabel.Spm99AnalyzeHeader
-    try:
-        header: Any = kind(block, check=False)
-        header.check_fix(error_level=40)
-    except nibabel.spatialimages.HeaderDataError as problem:
-        raise BadInput(f"its header is not that of a NIfTI file ({problem}); expected a valid one; mend it") from None
+    header: Any = kind(block, check=False)
+    header.check_fix(error_level=40)
     header.sizeof_hdr = length
     return header
 
