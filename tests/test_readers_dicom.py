@@ -213,6 +213,14 @@ def test_two_phases_are_a_choice(tmp_path, mark):
         check(read(tmp_path / "a", time=k), HOUNSFIELD + 200 * k)
 
 
+def test_fields_of_view_beside_each_other_are_a_choice(tmp_path):
+    series(tmp_path / "a")
+    series(tmp_path / "a", HOUNSFIELD + 5, name="{}b.dcm", at=lambda index: place(index) + 200 * AXES[0])
+    refused(tmp_path / "a", "first pixel in the plane at -100", "--time")
+    check(read(tmp_path / "a", time=0))
+    check(read(tmp_path / "a", time=1), HOUNSFIELD + 5, lambda index: place(index) + 200 * AXES[0])
+
+
 def test_a_phase_that_lacks_a_slice(tmp_path):
     linear = 10 * X + 20 * Y + 30 * Z - 900
     series(tmp_path / "a", linear, TemporalPositionIdentifier=1)
@@ -335,3 +343,22 @@ def test_what_the_header_lacks_is_assumed_and_said(tmp_path):
     )
     volume = read(tmp_path / "a.dcm", "does not say where its slices lie")
     assert np.array_equal(volume.values, HOUNSFIELD) and np.allclose(volume.spacing, 1)
+
+
+def test_a_gzipped_multi_frame_of_philips_lies_where_nibabel_says():
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # it calls itself experimental
+        from nibabel.nicom import dicomwrappers
+    path = Path(dicomwrappers.__file__).parent / "tests" / "data" / "philips_mprage.dcm.gz"
+    if not path.exists():
+        pytest.skip("this nibabel comes without its test data")
+    with gzip.open(path) as stream, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        there = dicomwrappers.wrapper_from_data(pydicom.dcmread(stream))
+        values, affine = there.get_data(), there.affine
+    volume = read(path)
+    index = np.random.default_rng(0).integers(0, values.shape, (200, 3))
+    world = index @ affine[:3, :3].T + affine[:3, 3]
+    found = np.linalg.solve(volume.direction * volume.spacing, (world - volume.origin).T).T
+    assert np.abs(found - found.round()).max() < 0.01
+    assert np.allclose(volume.values[tuple(found.round().astype(int).T)], values[tuple(index.T)])

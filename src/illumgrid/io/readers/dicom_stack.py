@@ -3,7 +3,7 @@
 import itertools
 from collections import Counter, defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -14,6 +14,9 @@ from illumgrid.io.readers.stored import Note
 
 ON_PLACE = 0.02
 """A slice this near to its place on the even lattice, in slices, is there: positions are written with few digits."""
+
+ASIDE = "first pixel in the plane at"
+"""What tells fields of view beside each other from each other."""
 
 LONGEST_GAP = 3
 """Slices; what is missing between two slices is interpolated up to this, and beyond it refused."""
@@ -81,6 +84,7 @@ def phases(frames: Sequence[Frame]) -> list[tuple[str, list[Frame]]]:
     most = max(Counter(places.tolist()).values())
     if most == 1:
         return _interleaved(frames, depth) or [("", list(frames))]
+    frames = [replace(frame, marks={**frame.marks, ASIDE: _aside(frame)}) for frame in frames]
     for marks in _tellers(frames):
         parts = _by(frames, marks)
         sizes = [Counter(places[members].tolist()) for members in parts.values()]
@@ -93,6 +97,12 @@ def phases(frames: Sequence[Frame]) -> list[tuple[str, list[Frame]]]:
         ranked[seen[int(places[k])]].append(frames[k])
         seen[int(places[k])] += 1
     return [(f"repeat {rank + 1} of each place", part) for rank, part in ranked.items()]
+
+
+def _aside(frame: Frame) -> str:
+    """Where the first pixel of a frame lies in its plane, millimetres along rows and columns."""
+    assert frame.axes is not None and frame.position is not None
+    return " ".join(f"{x:.0f}" for x in frame.axes @ frame.position + 0.0)
 
 
 def _tellers(frames: Sequence[Frame]) -> list[tuple[str, ...]]:
