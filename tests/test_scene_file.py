@@ -160,7 +160,7 @@ RADIANCE = "[background]\nradiance = "
         (FIELD + "emission = [-1, 0, 0]", ["[[field]] 1 'a'", "emission", "from 0 up"]),
         (FIELD + "emission = {r = 1}", ["emission is {'r': 1}"]),
         (FIELD + "range = [0.5]", ["[[field]] 1 'a'", "range is [0.5]", "lowest and highest"]),
-        (FIELD + f"range = [0, {10**400}]", ["range is [0, 1000", "characters)", "none beyond 1e+300"]),
+        (FIELD + f"range = [0, {10**400}]", ["range is [0, 1000", "characters)", "none beyond 1.7e+308"]),
         (FIELD + "range = [0.9, 0.3]", ["[[field]] 1 'a'", "range", "[0.9, 0.3]"]),
         (FIELD + "range = [7, 9]", ["[[field]] 1 'a'", "misses its data"]),
         (FIELD + 'inside = "left"', ["[[field]] 1 'a'", "inside is 'left'", "'above' or 'below'"]),

@@ -123,3 +123,23 @@ def test_numbers_are_told_apart():
     assert shown_range((1e6 - 0.2, 1e6 + 0.2)) == "999999.8 to 1000000.2"
     assert shown_range((0.123456, 0.9)) == "0.1235 to 0.9" and shown(0.0) == "0"
     assert shown_range((1.5e-58, 2.5e-58)) == "1.5e-58 to 2.5e-58"
+
+
+def test_exports_keep_the_digits(tmp_path):
+    scene = ig.Scene.sky(ig.Volume(1e6 + 0.2 * ball()), range=(1e6 + 0.11, 1e6 + 0.16))
+    light = ig.run(scene, grid=17, paths=1, bounces=0, isovalues=3)
+    from illumgrid.io import exports
+
+    for ending in ("nrrd", "vti", "npz"):
+        exports.write(light, tmp_path / f"a.{ending}", on="field", array="field" if ending == "nrrd" else None)
+    for back in (ig.read_volume(tmp_path / "a.nrrd"), ig.read_volume(tmp_path / "a.vti", array="field")):
+        assert np.allclose(back.in_units(back.values.astype(float)), 1e6 + 0.2 * ball(), rtol=0, atol=1e-7)
+    with np.load(tmp_path / "a.npz") as arrays:
+        assert np.allclose(arrays["field"], 1e6 + 0.2 * ball(), rtol=0, atol=1e-7)
+
+
+def test_a_scene_file_takes_ranges_of_any_scale(tmp_path):
+    np.save(tmp_path / "a.npy", 1e302 * ball())
+    text = '[[field]]\nname = "a"\nvolume = "a.npy"\nrange = [5e301, 8e301]\n'
+    (tmp_path / "s.toml").write_text(text, "utf-8")
+    assert ig.read_scene(tmp_path / "s.toml").fields[0].range.tolist() == [5e301, 8e301]

@@ -5,7 +5,7 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from illumgrid.errors import BadInput
+from illumgrid.errors import BadInput, shown
 from illumgrid.io import store
 from illumgrid.io.exports import arrays, surface, vti
 
@@ -101,7 +101,8 @@ def write(
             SURFACES[ending](fresh, lit)
         progress("file", 1, 1)
         count = len(lit.mesh.faces)
-        return f"isosurface {lit.isovalue:g} of {lit.field!r}, {count} triangles, exposure {lit.exposure:.4g}"
+        level = shown(lit.isovalue, light.scene.fields[number].range, 6)
+        return f"isosurface {level} of {lit.field!r}, {count} triangles, exposure {lit.exposure:.4g}"
     names = (array or "irradiance",) if ending == ".nrrd" else arrays.NAMES
     points = arrays.points_of(light, number, on or "grid", names, progress)
     with store.fresh_file(path) as fresh:

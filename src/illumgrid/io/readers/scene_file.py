@@ -159,7 +159,7 @@ _FIELD: Mapping[str, Take] = {
     "name": _text,
     "volume": _text,
     **_MATERIAL,
-    "range": _numbers(2, "two numbers in brackets (lowest and highest isovalue)", most=1e300),
+    "range": _numbers(2, "two numbers in brackets (lowest and highest isovalue)", most=1.7e308),
     "inside": _side,
     **_READING,
 }
