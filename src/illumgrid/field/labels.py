@@ -35,7 +35,7 @@ def labels_in(volume: Volume) -> list[int]:
     if not 2 <= len(values) <= MOST:
         return []
     background = values[counts.argmax()]
-    found = [int(value) for value in values if value != background]
+    found = [round(float(value)) for value in volume.in_units(values[values != background])]
     if len(values) == 2:
         return found
     rank = np.searchsorted(values, np.nan_to_num(sample))
