@@ -35,7 +35,7 @@ def read(source: Source, wanted: Wanted) -> Stored:
         _refuse_damaged(reports)
         series, names = tiff.series[number], channel_names(tiff, number)
         check_pages(tiff, series)
-        values, notes = _three_axes(real(series.asarray()), series.axes, wanted, names)
+        values, notes = _three_axes(real(series.asarray(maxworkers=1)), series.axes, wanted, names)
         spacing, unit, more = calibrated(tiff, number)
         notes = (*notes, *more, *_serious(reports))
     return Stored(values, np.zeros(3), np.diag(spacing), unit=unit, notes=notes)
@@ -61,7 +61,7 @@ def read_folder(files: Sequence[Path], wanted: Wanted) -> Stored:
                         "differs in size or type from the first slice; expected equal slices; move it elsewhere"
                     )
                 check_pages(tiff, series)
-                slices.append(real(series.asarray()))
+                slices.append(real(series.asarray(maxworkers=1)))
         except BadInput as problem:
             raise BadInput(f"its slice {file.name} {problem}") from None
     if len(slices) < 2:
