@@ -188,3 +188,14 @@ def test_dx_of_vectors(tmp_path):
     whole = dx_file(tmp_path / "a.dx").read_text()
     (tmp_path / "a.dx").write_text(whole.replace("rank 0", "rank 1 shape 3"))
     refused(tmp_path / "a.dx", "vectors")
+
+
+def test_escapes_in_names_do_not_reach_the_terminal(tmp_path):
+    body = b"\n".join(b"%d" % n for n in range(210))
+    field = b"\nFIELD f 1\n\x1b]0;owned\x07 1 210 int\n" + body
+    (tmp_path / "a.vtk").write_bytes(vtk_head("ASCII") + body + field)
+    with pytest.warns(IllumgridWarning, match=r"choice: .*\?\]0;owned\?") as caught:
+        read_volume(tmp_path / "a.vtk")
+    assert all(str(one.message).isprintable() for one in caught)
+    (tmp_path / "b.vtk").write_bytes(vtk_head("ASCII").replace(b"STRUCTURED_POINTS", b"POLY\x1b[2JDATA"))
+    assert refused(tmp_path / "b.vtk", "POLY?[2JDATA").isprintable()

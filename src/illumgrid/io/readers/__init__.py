@@ -113,7 +113,7 @@ def read_volume(
     if not os.fspath(path):
         raise BadInput(f"the name of the volume is empty; {EXPECTED}")  # and not the folder one is in
     file = Path(os.path.abspath(path))
-    shown = file.name.encode("utf-8", "replace").decode()
+    shown = _printable(file.name.encode("utf-8", "replace").decode())
     try:
         stored = _read(file, Wanted(channel, time, array))
         if spacing is not None:
@@ -128,14 +128,19 @@ def read_volume(
             stored = coarser(stored, downsample)
         volume, notes = place(stored)
     except BadInput as problem:
-        raise BadInput(f"{shown}: {problem}") from None
+        raise BadInput(f"{shown}: {_printable(str(problem))}") from None
     except MemoryError as problem:
         raise BadInput(f"{shown}: too large for the memory of this machine; expected less; coarsen it") from problem
     except UNREADABLE as problem:
         raise BadInput(f"{shown}: was not understood ({_reason(problem)}); {EXPECTED}") from problem
     for name, sentence in notes:
-        tell(name, f"{shown}: {sentence}", stacklevel=2)
+        tell(name, f"{shown}: {_printable(sentence)}", stacklevel=2)
     return volume
+
+
+def _printable(text: str) -> str:
+    """Without what a terminal would obey: names in headers and of files are not trusted."""
+    return "".join(c if c.isprintable() or c == "\0" else "?" for c in text)
 
 
 def _reason(problem: BaseException) -> str:
