@@ -238,8 +238,8 @@ def _on_few_rows(scene: Scene, seed: int, rows: int = 4, count: int = 32) -> Que
     """
     specs = [GridSpec.over(field.volume, 10) for field in scene.fields]
     nodes = join_queries([q for q in Direct().queries(scene, specs, seed) if len(q)])
-    low, high = np.array([field.range for field in scene.fields])[nodes.target].T
-    place = (nodes.level[np.arange(len(nodes)), nodes.target] - low) / (high - low)
+    first, last = np.array([field.sweep for field in scene.fields])[nodes.target].T
+    place = (nodes.level[np.arange(len(nodes)), nodes.target] - first) / (last - first)
     shuffled = np.random.default_rng(seed).permutation(len(nodes))  # many stand at an end of the range
     asked = []
     for number, part in enumerate(np.array_split(shuffled[np.argsort(place[shuffled], kind="stable")], rows)):

@@ -39,7 +39,7 @@ def bench(
     from illumgrid.io import store
     from illumgrid.show.difference import studio
 
-    given = _input(source, None, limits, None, None, {})
+    given = _input(source, None, limits, None, False, None, {})
     folder = output or Path(f"{given.name}-bench")
     store.claim_new(folder)
     with reported_warnings():

@@ -1,6 +1,6 @@
 """``illumgrid run``: the whole chain, from a volume or a scene to a finished folder."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -14,7 +14,7 @@ from illumgrid.errors import BadInput, shown_range, tell
 
 if TYPE_CHECKING:
     from illumgrid.field.builtin import Preset
-    from illumgrid.field.scene import Scene
+    from illumgrid.field.scene import Field, Scene
     from illumgrid.field.volume import Side
     from illumgrid.light import Illumination
 
@@ -33,6 +33,7 @@ def _input(
     surroundings: str | None,
     limits: tuple[float, float] | None,
     inside: str | None,
+    signed: bool,
     albedo: tuple[float, float, float] | None,
     reading: dict[str, Any],
 ) -> Input:
@@ -43,7 +44,9 @@ def _input(
     name = "nucleus" if source is None else source
     preset = SCENES.get(name) if source is None or not Path(source).exists() else None
     if preset or name.lower().endswith(".toml"):
-        if extra := given(scene=surroundings, range=limits, inside=inside, albedo=albedo, **reading):
+        if extra := given(
+            scene=surroundings, range=limits, inside=inside, signed=signed or None, albedo=albedo, **reading
+        ):
             options = ", ".join(f"--{option}" for option in extra)
             what, todo = ("built-in scene", "leave") if preset else ("scene file", "write them into the file and leave")
             raise BadInput(
@@ -54,7 +57,11 @@ def _input(
         raise BadInput(f"--inside is {inside!r}; expected above or below")
     if surroundings not in (None, "sky", "floor", "box"):
         raise BadInput(f"--scene is {surroundings!r}; expected sky, floor or box")
-    side: Side = "below" if inside == "below" else "above"
+    if signed and (also := given(inside=inside, label=reading.get("label"))):
+        raise BadInput(
+            f"--signed and --{next(iter(also))} came together; expected one of them: --signed lights h >= c and h <= -c"
+        )
+    side: Side | None = None if signed else "below" if inside == "below" else "above"
     make = partial(_volume_scene, name, surroundings or "sky", albedo, limits, side, reading)
     return Input(volume_name(name), make)
 
@@ -66,10 +73,15 @@ def _scene_file(name: str) -> Input:
 
 
 def _volume_scene(
-    source: str, surroundings: str, albedo: Any, limits: Any, inside: "Side", reading: dict[str, Any], smooth: float
-) -> "Scene":
+    source: str, surroundings: str, albedo: Any, limits: Any, inside: "Side | None", reading: dict[str, Any],
+    smooth: float,
+) -> "Scene":  # fmt: skip
+    """The fields of a volume with what is around them; both signs of it if `inside` is None."""
+    import numpy as np
+
     from illumgrid.field.labels import fields_of
-    from illumgrid.field.scene import Scene
+    from illumgrid.field.scene import Material, Scene
+    from illumgrid.field.signed import signed_pair, without_gaps
     from illumgrid.field.volume import finite
     from illumgrid.field.volume import smooth as blur
     from illumgrid.io.readers import read_volume, volume_name
@@ -78,11 +90,20 @@ def _volume_scene(
     name, labels = volume_name(source), labels_of(reading.get("label"))
     if labels:
         each = {label: blur(read_volume(source, **{**reading, "label": label}), smooth) for label in labels}
-        fields = fields_of(name, each, albedo, limits)
-        scene = around(fields[0].volume, fields[0].material.albedo, fields[0].range, inside, name)
-        return replace(scene, fields=tuple(fields))
-    volume = finite(read_volume(source, **reading), inside)
+        return _around_all(around, fields_of(name, each, albedo, limits))
+    volume = read_volume(source, **reading)
+    if inside is None:
+        material = None if albedo is None else Material(np.asarray(albedo))
+        return _around_all(around, signed_pair(name, blur(without_gaps(volume), smooth), limits, material))
+    volume = finite(volume, inside)
     return around(blur(volume, smooth), albedo or (0.8, 0.8, 0.8), limits, inside, name)
+
+
+def _around_all(around: Callable[..., "Scene"], fields: "Sequence[Field]") -> "Scene":
+    """Several fields of one lattice with what `around` puts around the first."""
+    first = fields[0]
+    scene = around(first.volume, first.material.albedo, first.range, first.inside, first.name)
+    return replace(scene, fields=tuple(fields))
 
 
 def _smoothed(make: Callable[[], "Scene"], smooth: float) -> "Scene":
@@ -141,6 +162,9 @@ def run(
     inside: Annotated[
         str | None, typer.Option(help="Which side of the isovalue is solid: above, below. [default: above]")
     ] = None,
+    signed: Annotated[
+        bool, typer.Option("--signed", help="Light h >= c and h <= -c, in two colours; --range is that of c, above 0.")
+    ] = False,
     backend: Annotated[str, typer.Option(help="Light transport: auto, numba, reference.")] = "auto",
     paths: Annotated[
         int | None, typer.Option(min=1, metavar="N", help="Light paths from every query. [default: 32]")
@@ -208,7 +232,7 @@ def run(
         reading = given(
             spacing=spacing, channel=channel, time=time_step, array=array, label=label, crop=crop, downsample=downsample
         )
-        asked = _input(source, surroundings, limits, inside, albedo, reading)
+        asked = _input(source, surroundings, limits, inside, signed, albedo, reading)
         if asked.preset and error is None and seconds is None:
             grid, paths = grid or asked.preset.grid, paths or asked.preset.paths
             isovalues = isovalues or asked.preset.isovalues

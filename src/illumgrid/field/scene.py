@@ -107,6 +107,8 @@ class Field:
         Lowest and highest isovalue of the sweep; by default those of `suggest_range`.
     inside : {"above", "below"}
         Which side of the level set is solid: h >= c or h <= c.
+    falling : bool
+        Whether the sweep runs from the high end of the range to the low end.
     """
 
     name: str
@@ -114,6 +116,7 @@ class Field:
     material: Material = field(default_factory=Material)
     range: Floats = None  # type: ignore[assignment]
     inside: Side = "above"
+    falling: bool = False
 
     def __post_init__(self) -> None:
         if not (isinstance(self.name, str) and self.name and self.name.isprintable()):
@@ -157,10 +160,15 @@ class Field:
         """Whether points with these values of h lie in the solids of these isovalues; or both as stored values."""
         return np.asarray(self.upward * np.asarray(values) >= self.upward * np.asarray(isovalues))
 
+    @property
+    def sweep(self) -> Floats:
+        """Isovalues (2,) at t = 0 and t = 1: the ends of the range, the high one first if the field is `falling`."""
+        return self.range[::-1] if self.falling else self.range
+
     def place(self, isovalues: ArrayLike) -> Floats:
-        """Position of isovalues in the sweep: 0 at the low end of the range, 1 at the high end, not clamped."""
-        low, high = self.range
-        return np.asarray((np.asarray(isovalues, float) - low) / (high - low))
+        """Position of isovalues in the sweep: 0 at its first isovalue, 1 at its last, not clamped."""
+        first, last = self.sweep
+        return np.asarray((np.asarray(isovalues, float) - first) / (last - first))
 
 
 @dataclass(frozen=True, eq=False)
@@ -311,10 +319,13 @@ class Scene:
         return cls(fields, box_around(volume))
 
     def levels(self, t: ArrayLike) -> Floats:
-        """Settings (n, F) of all sliders for t (n,) from 0, the lowest isovalues, to 1, the highest (clamped)."""
-        low, high = np.array([f.range for f in self.fields]).T
+        """Settings (n, F) of all sliders for t (n,) from 0, the first isovalues of the sweep, to 1, the last (clamped).
+
+        They rise, except those of fields that are `falling`.
+        """
+        first, last = np.array([f.sweep for f in self.fields]).T
         share = np.clip(np.atleast_1d(np.asarray(t, float)), 0.0, 1.0)[:, None]
-        return np.asarray((1 - share) * low + share * high)
+        return np.asarray((1 - share) * first + share * last)
 
     def levels_through(self, field: int, isovalues: ArrayLike) -> Floats:
         """Settings (n, F) with field number `field` at `isovalues` (n,), the others at the same sweep position."""

@@ -216,7 +216,7 @@ def _describe(stored: Stored) -> Record:
         return {"shape": of.shape} | {name: getattr(of, name).tolist() for name in PLACE}
 
     fields = [
-        {"name": f.name, "range": f.range.tolist(), "inside": f.inside}
+        {"name": f.name, "range": f.range.tolist(), "inside": f.inside, "falling": f.falling}
         | {"slope": f.volume.slope, "intercept": f.volume.intercept, "unit": f.volume.unit}
         | {"albedo": f.material.albedo.tolist(), "emission": f.material.emission.tolist()}
         | lattice(f.volume)
@@ -275,7 +275,8 @@ def _rebuild(record: Record, parts: dict[str, dict[str, Image]]) -> Stored:
         slope, intercept = about.get("slope", 1.0), about.get("intercept", 0.0)
         volume = Volume(values, origin, spacing, direction, slope, intercept, about.get("unit"))
         material = Material(about["albedo"], about["emission"])
-        fields.append(Field(about["name"], volume, material, about["range"], about["inside"]))
+        falling = about.get("falling", False)
+        fields.append(Field(about["name"], volume, material, about["range"], about["inside"], falling))
     quads, walls = [], []
     for about in record["scene"]["quads"]:
         part, shape = f"wall/{about['name']}", _wall_shape(about, record)

@@ -116,9 +116,11 @@ def adaptive_rows(scene: Scene, count: int, topology: float = TOPOLOGY) -> Float
     edges = scene.levels(sweep)
     step_length, changes = np.zeros((2, _BINS))
     for number, field in enumerate(scene.fields):
-        step_length = np.maximum(step_length, distance_between(field, edges[:, number]))
+        order = -1 if field.falling else 1
+        rising = edges[::order, number]
+        step_length = np.maximum(step_length, distance_between(field, rising)[::order])
         at, change = critical_values(field)
-        changes += np.histogram(at, edges[:, number], weights=np.abs(change))[0]
+        changes += np.histogram(at, rising, weights=np.abs(change))[0][::order]
     if not step_length.any():
         return level_table(scene, count).table  # no cell is crossed: no basis for a choice
     changes[step_length == 0] = 0

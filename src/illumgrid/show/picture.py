@@ -138,8 +138,8 @@ def _shown(
     scene = light.scene
     number = scene.number_of(field)
     row = scene.levels(0.5)[0] if isovalue is None else scene.levels_through(number, isovalue)[0]
-    low, high = scene.fields[number].range
-    return Shown(light, row, float(np.clip((row[number] - low) / (high - low), 0.0, 1.0)), local, trust, stops)
+    t = float(np.clip(scene.fields[number].place(row[number]), 0.0, 1.0))
+    return Shown(light, row, t, local, trust, stops)
 
 
 def _drawn(shown: Shown, camera: Camera, sheet: _Sheet, rows: int) -> Picture:

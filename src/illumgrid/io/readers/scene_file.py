@@ -10,6 +10,7 @@ from typing import Any
 
 from illumgrid.errors import BadInput
 from illumgrid.field.scene import Field, Material, Quad, Scene
+from illumgrid.field.signed import signed_pair, without_gaps
 from illumgrid.field.volume import Volume, finite, smooth
 
 LIMIT = 1 << 20
@@ -32,7 +33,8 @@ def read_scene(path: str | os.PathLike[str], *, smoothing: float = 0.0) -> Scene
     ----------
     path : str or path-like
         UTF-8, at most 1 MB, with these tables: ``[[field]]``, one or more, with `name`, `volume` (what `read_volume`
-        reads, relative to this file) and perhaps `albedo`, `emission`, `range`, `inside`, and the options of
+        reads, relative to this file) and perhaps `albedo`, `emission`, `range`, `inside`, `falling`, `signed` (true:
+        two fields, ``NAME-positive`` where h >= c and ``NAME-negative`` where h <= -c), and the options of
         `read_volume` (`spacing`, `channel`, `time`, `array`, `label`, `crop`, `downsample`); ``[[quad]]`` with `name`,
         `corner`, `edge_u`, `edge_v` and perhaps `albedo`, `emission`, `texels`; ``[background]`` with `radiance`. What
         is left out has the default of `Field`, `Material`, `Quad` or `Scene`.
@@ -115,6 +117,12 @@ def _side(key: str, value: Any) -> str:
     return str(value)
 
 
+def _yes(key: str, value: Any) -> bool:
+    if not isinstance(value, bool):
+        raise BadInput(f"{key} is {_shown(value)}; expected true or false")
+    return value
+
+
 def _numbers(count: int, expected: str, kind: type[int] | type[float] = float, most: float = 1e30) -> Take:
     """Takes a list of `count` numbers (whole ones if `kind` is int) that are finite and not beyond `most`."""
 
@@ -161,6 +169,8 @@ _FIELD: Mapping[str, Take] = {
     **_MATERIAL,
     "range": _numbers(2, "two numbers in brackets (lowest and highest isovalue)", most=1.7e308),
     "inside": _side,
+    "falling": _yes,
+    "signed": _yes,
     **_READING,
 }
 _QUAD: Mapping[str, Take] = {
@@ -226,16 +236,25 @@ def _scene(tables: Table, folder: Path, smoothing: float) -> Scene:
         if table["name"] in seen:
             raise BadInput(f"{place}: name is that of {seen[table['name']]}, too; expected names that differ")
         seen[table["name"]] = place
-    walls, solids = [], []
+    walls, solids = list[Quad](), list[Field]()
     for place, table in quads:
         with _place(place):
             walls.append(Quad(**table))
     volumes: dict[str, Volume] = {}  # two fields may be two ranges of one file
     for place, table in fields:  # last, because reading takes longest
         with _place(place):
-            volume = _volume(table, folder, smoothing, volumes)
-            solids.append(Field(**{**_without(table, _READING), "volume": volume}))
+            solids.extend(_fields(table, _volume(table, folder, smoothing, volumes)))
     return Scene(tuple(solids), tuple(walls), radiance)
+
+
+def _fields(table: Table, volume: Volume) -> tuple[Field, ...]:
+    """The field of a checked table, or the two of a signed one."""
+    if table.get("signed"):
+        for key in ("inside", "falling"):
+            if key in table:
+                raise BadInput(f"signed and {key} came together; expected one of them; leave {key} out")
+        return signed_pair(table["name"], volume, table.get("range"), table["material"])
+    return (Field(**{**_without(table, {**_READING, "signed": 0}), "volume": volume}),)
 
 
 def _without(table: Table, keys: Mapping[str, Any]) -> Table:
@@ -243,9 +262,9 @@ def _without(table: Table, keys: Mapping[str, Any]) -> Table:
 
 
 def _with_material(table: Table) -> Table:
-    """The table with `material` in place of `albedo` and `emission`."""
-    material = Material(**{key: table[key] for key in _MATERIAL if key in table})
-    return {**_without(table, _MATERIAL), "material": material}
+    """The table with `material` in place of `albedo` and `emission`; None for a signed field that says neither."""
+    given = {key: table[key] for key in _MATERIAL if key in table}
+    return {**_without(table, _MATERIAL), "material": None if table.get("signed") and not given else Material(**given)}
 
 
 def _volume(table: Table, folder: Path, smoothing: float, read: dict[str, Volume]) -> Volume:
@@ -259,4 +278,5 @@ def _volume(table: Table, folder: Path, smoothing: float, read: dict[str, Volume
             read[known] = read_volume(folder / table["volume"], **reading)
         if smoothing == 0:
             return read[known]
-        return smooth(finite(read[known], table.get("inside", "above")), smoothing)
+        whole = without_gaps(read[known]) if table.get("signed") else finite(read[known], table.get("inside", "above"))
+        return smooth(whole, smoothing)

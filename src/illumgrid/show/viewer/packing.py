@@ -83,6 +83,7 @@ def _field(light: Illumination, number: int, stage: Stage, into: Bytes, notes: l
     return {
         "name": field.name,
         "range": field.range.tolist(),
+        "sweep": field.sweep.tolist(),
         "upward": sign,
         "albedo": albedo.tolist(),
         "swatch": _css(WHITE * albedo / albedo.max(initial=1e-9)),

@@ -2,6 +2,7 @@
 
 import { bricks, fieldValues, lightTexels } from "./numbers.js";
 import { dot, eyeOf, facing, sum } from "./camera.js";
+import { isovalueOf } from "./state.js";
 
 export const LOOKS = ["matte", "shiny", "translucent"];
 const LAYERS = 4; // surfaces behind one another that a translucent look shows
@@ -184,7 +185,7 @@ export class Picture {
 
   // Isovalue of a field at this place of the sweep, upwards.
   level(field, sweep) {
-    return field.upward * ((1 - sweep) * field.range[0] + sweep * field.range[1]);
+    return field.upward * isovalueOf(field, sweep);
   }
 
   copy(from, into, blend, encode = false) {

@@ -4,8 +4,8 @@ export const DEFAULTS = { sweep: 0.5, light: "global", split: 0.5, stops: 0, loo
 
 const short = (x) => String(Number(x.toPrecision(6)));
 export const clamp = (x, low, high) => Math.min(high, Math.max(low, x));
-export const sweepOf = (field, isovalue) => clamp((isovalue - field.range[0]) / (field.range[1] - field.range[0]), 0, 1);
-export const isovalueOf = (field, sweep) => (1 - sweep) * field.range[0] + sweep * field.range[1];
+export const sweepOf = ({ sweep: [first, last] }, isovalue) => clamp((isovalue - first) / (last - first), 0, 1);
+export const isovalueOf = (field, sweep) => (1 - sweep) * field.sweep[0] + sweep * field.sweep[1];
 
 // "isovalue=0.45&view=0.52,0.31,4.1,0,0,0&light=both": only what is not as the page opens.
 export function written(state, scene) {

@@ -1,6 +1,7 @@
 // The same view in a notebook: the traits of the anywidget model follow the view, and set it.
 
 import { inflate } from "./numbers.js";
+import { isovalueOf, sweepOf } from "./state.js";
 import { complain, view } from "./view.js";
 
 async function render({ model, el }) {
@@ -13,7 +14,7 @@ async function render({ model, el }) {
     const scene = JSON.parse(model.get("_scene")), held = model.get("_data");
     const data = await inflate(new Uint8Array(held.buffer, held.byteOffset, held.byteLength));
     const [low, high] = scene.fields[0].range;
-    const isovalue = (sweep) => (1 - sweep) * low + sweep * high;
+    const isovalue = (sweep) => isovalueOf(scene.fields[0], sweep);
     const near = (a, b) => Math.abs(a - b) < 1e-9 * (high - low);
     const shown = view(root, scene, data, JSON.parse(model.get("_shaders")), {
       address: false,
@@ -24,7 +25,7 @@ async function render({ model, el }) {
       },
     });
     const follow = () => {
-      if (!near(model.get("isovalue"), isovalue(shown.state.sweep))) shown.put({ sweep: (model.get("isovalue") - low) / (high - low) });
+      if (!near(model.get("isovalue"), isovalue(shown.state.sweep))) shown.put({ sweep: sweepOf(scene.fields[0], model.get("isovalue")) });
     };
     model.on("change:isovalue", follow);
     follow();
