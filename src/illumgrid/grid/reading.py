@@ -81,10 +81,12 @@ def estimate(start, place, light, variance, shape, u, level, normal, log, weight
     Samples lie in bins, one for each node of the lattice, `start` (nodes + 1,) in order. place (m, 8): index
     coordinates, level, normal, slope. The weights are those of a joint bilateral filter,
 
-        w = hat(dx) hat(dy) hat(dz) exp(-(δ/LEVEL)²/2) exp(-(1 - n·n')/TURN),   δ = |c' - c| / |∇h'|,
+        w = hat(dx) hat(dy) hat(dz) exp(-(δ/LEVEL)²/2) / |∇h'| exp(-(1 - n·n')/TURN),   δ = |c' - c| / |∇h'|,
 
     the value is that of the linear function of position which fits best (moving least squares, a ridge on its slope),
-    held within the range of the samples. Fills found (C,); returns variance and number of samples, 0 if none is near.
+    held within the range of the samples. A steep sample is near to more levels: divided by its slope, the weight is the
+    same in sum over all levels, or steep places, which are brighter on rough fields, would be preferred. Fills found
+    (C,); returns variance and number of samples, 0 if none is near.
 
     The variance is Σ a² σ² of the samples' noise, a their weights in the fit, and (1 + Σ a²) s², s² being by how much
     more than noise the samples around scatter about the fit: the light at the point does so too.
@@ -110,7 +112,7 @@ def estimate(start, place, light, variance, shape, u, level, normal, log, weight
                 exponent = -0.5 * delta * delta - (1.0 - cosine) / TURN
                 if exponent < top - NEGLIGIBLE:
                     continue
-                log[count], weights[count], near[count] = exponent, hats, i
+                log[count], weights[count], near[count] = exponent, hats / slope, i
                 top = max(top, exponent)
                 count += 1
     if count == 0:
