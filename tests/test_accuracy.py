@@ -226,7 +226,7 @@ def test_the_probe_of_an_error_climbs_to_finer_grids_where_its_first_choice_will
         return measured(grid, 0.001 if first or grid >= 20 else 0.1, nodes=grid**3)
 
     monkeypatch.setattr(Probe, "measure", lucky)
-    plan = planned(scene, BACKEND, level_table(scene, 4), error=0.02, seed=0)
+    plan = planned(scene, prepare(BACKEND, scene), level_table(scene, 4), error=0.02, seed=0)
     assert plan.met and plan.grid >= 20
 
 

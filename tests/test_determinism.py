@@ -31,7 +31,7 @@ def specs_of(scene, nodes=11):
 
 
 def light(scene, sampler, seed=0, threads=0, **how):
-    stages = sampler, Numba(threads=threads), Nearest()
+    stages = sampler, Numba(threads=threads).prepare(scene), Nearest()
     levels = level_table(scene, 2)
     return bake(scene, specs_of(scene), levels, *stages, paths=[range(6)], bounces=3, seed=seed, **how).grids
 

@@ -41,7 +41,7 @@ def direct_grid(volume, limits, inside="above", seed=0):
     scene = Scene.sky(volume, (0.5, 0.5, 0.5), limits, inside)
     spec = GridSpec.over(volume, max(volume.shape))
     assert spec.shape == volume.shape
-    stages = Direct(), Numba(), Nearest()
+    stages = Direct(), Numba().prepare(scene), Nearest()
     light = bake(scene, [spec], level_table(scene, 2), *stages, paths=[range(PATHS)], bounces=3, seed=seed)
     return light.grids[0]
 

@@ -70,7 +70,7 @@ def baked():
     wall = Quad("wall", (1, 1, 4.3), (6.5, 0, 0.1), (0, 5.7, 0.2), texels=(13, 7))
     scene = Scene((field,), (wall,), np.ones(3))
     levels = level_table(scene, 4)
-    stages = Direct(), Numba(), Nearest()
+    stages = Direct(), Numba().prepare(scene), Nearest()
     return scene, levels, bake(scene, [GridSpec.over(field.volume, 4)], levels, *stages, paths=[range(8)], bounces=2)
 
 

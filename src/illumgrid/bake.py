@@ -16,10 +16,10 @@ from illumgrid.grid import GridSpec, IlluminationGrid, Nodes, WallTexture, chann
 from illumgrid.grid.channels import Channels
 from illumgrid.grid.nodes import reachable
 from illumgrid.samplers.direct import Direct
-from illumgrid.stages import Backend, Interpolator, Sampler
+from illumgrid.stages import Interpolator, Sampler
 from illumgrid.transport.samples import Queries, Samples, combine, join_queries, join_samples
 from illumgrid.transport.stages import fill_nodes
-from illumgrid.transport.tracer import Tracer, prepare
+from illumgrid.transport.tracer import Tracer
 
 Progress = Callable[[str, int, int], None]
 """Called with what is being done, how much of it is done, and how much there is."""
@@ -282,7 +282,7 @@ def bake(
     specs: Sequence[GridSpec],
     levels: Levels,
     sampler: Sampler,
-    backend: Backend,
+    tracer: Tracer,
     interpolator: Interpolator,
     *,
     paths: Iterable[range],
@@ -300,8 +300,10 @@ def bake(
         The nodes, one lattice a field.
     levels : Levels
         Rows of the sweep at which the walls are lit.
-    sampler, backend, interpolator
+    sampler, interpolator
         Stage objects.
+    tracer : Tracer
+        A backend with the scene set up: `illumgrid.transport.tracer.prepare`.
     paths : iterable of range
         Numbers of the paths from every node, one range after the other; the next is asked for when one is walked.
         A texel has `texel_paths` times as many.
@@ -320,7 +322,6 @@ def bake(
     state = Bake((*nodes, *texels), (1,) * len(nodes) + (more,) * len(texels), bounces, seed)
     del nodes, texels
     clock.append(time.perf_counter())
-    tracer = prepare(backend, scene)
     for numbers in paths:
         state = state.walk(tracer, numbers, map, progress)
     clock.append(time.perf_counter())

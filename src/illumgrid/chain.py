@@ -112,13 +112,13 @@ def run(
     if isovalues is not None and isinstance(sampler, str) and "count" in registry.option_names("sampler", sampler):
         options["count"] = isovalues
     chosen = _stage("sampler", sampler, options), _stage("backend", backend), _stage("interpolator", interpolator)
-    begun, plan = time.perf_counter(), None
+    begun, plan, tracer = time.perf_counter(), None, prepare(chosen[1], scene)
     walked: Iterable[range] = [range(PATHS if paths is None else paths)]
     if error is not None or seconds is not None:
         _check_plannable(error, seconds, *chosen)
         progress("pilot", 0, 1)
         plan = planned(
-            scene, chosen[1], levels, error=error, seconds=seconds, grid=grid, paths=paths, bounces=bounces, seed=seed
+            scene, tracer, levels, error=error, seconds=seconds, grid=grid, paths=paths, bounces=bounces, seed=seed
         )
         progress("pilot", 1, 1)
         grid, bounces = plan.grid, plan.bounces
@@ -126,12 +126,14 @@ def run(
     if not _shines(scene):
         tell("dark", "no background, lamp or surface of this scene emits light: all of it will be 0", stacklevel=2)
     specs = specs_over(scene, grid)
-    tracer = prepare(chosen[1], scene)
     if bounces is None:
         bounces, left_out = enough_bounces(scene, tracer, seed)
     else:
         left_out = light_left_out(scene, tracer, bounces, seed)
-    baked = bake(scene, specs, levels, *chosen, paths=walked, bounces=bounces, seed=seed, map=map, progress=progress)
+    baked = bake(
+        scene, specs, levels, chosen[0], tracer, chosen[2],
+        paths=walked, bounces=bounces, seed=seed, map=map, progress=progress,
+    )  # fmt: skip
     for field, holes in zip(scene.fields, baked.holes):
         if holes:
             tell(

@@ -11,8 +11,7 @@ from illumgrid.accuracy.probe import FEWEST_PATHS, MOST_PATHS, Measured, Probe
 from illumgrid.bake import shifted_seed, texel_paths, wall_queries
 from illumgrid.field.lattice import specs_over
 from illumgrid.field.scene import Levels, Scene
-from illumgrid.stages import Backend
-from illumgrid.transport.tracer import Tracer, prepare
+from illumgrid.transport.tracer import Tracer
 
 SHARE = 0.25  # of the asked error that the bounces left out may be
 JUDGED = 0.95  # of the asked seconds: the rest is for the judgement at the end
@@ -167,7 +166,7 @@ class Search:
 
 def planned(
     scene: Scene,
-    backend: Backend,
+    tracer: Tracer,
     levels: Levels,
     *,
     error: float | None = None,
@@ -180,9 +179,9 @@ def planned(
     """Choose nodes, paths and bounces of a run with `Direct` and `Nearest`, as far as they are not given.
 
     In the least time for a relative root mean square `error`, or the least error in `seconds`, with this choice and the
-    light of walls at `levels` included; `backend` marches level sets.
+    light of walls at `levels` included; the tracer marches level sets.
     """
-    begun, tracer = time.perf_counter(), prepare(backend, scene)
+    begun = time.perf_counter()
     left = np.inf if seconds is None else JUDGED * seconds
     goal = Goal(error, left, sum(len(queries) for queries in wall_queries(scene, levels)), paths, bounces)
     candidates = [grid] if grid else sizes(scene)
