@@ -36,18 +36,18 @@ def bench(
     from illumgrid.cli.report import files
     from illumgrid.cli.run import _input
     from illumgrid.constants import PATHS
-    from illumgrid.io import store
+    from illumgrid.io import disk
     from illumgrid.show.difference import studio
 
     given = _input(source, None, limits, None, False, None, {})
     folder = output or Path(f"{given.name}-bench")
-    store.claim_new(folder)
+    disk.claim_new(folder)
     with reported_warnings():
         scene = given.make(smooth or 0.0)
         with progress_bars() as progress:
             default = (given.preset.grid, given.preset.paths) if given.preset else (None, PATHS)
             found = race(scene, budget, seed, progress, default, studio)
         content, text = files(found, given.name, scene)
-    store.write_folder(folder, iter(content.items()))
+    disk.write_folder(folder, iter(content.items()))
     typer.echo(text)
     say(f"wrote {folder}; look at {folder / 'chart.png'}")

@@ -102,7 +102,7 @@ def preview(
     """Draw an isosurface of a finished run, several side by side, or a sweep through the range."""
     from illumgrid import show
     from illumgrid.chain import load
-    from illumgrid.io import store
+    from illumgrid.io import disk
 
     given = {
         "--sweep": sweep is not None, "--isovalue": isovalue is not None, "--isovalues": isovalues is not None,
@@ -121,7 +121,7 @@ def preview(
     seen_by = None if camera is None else _camera_in(camera)
     if grid_volume:
         picture = show.grid_volume(light, field, cut=cut, camera=seen_by, **options, **look)
-        store.write_file(_given(output), show.png(picture, _about(seen_by)))
+        disk.write_file(_given(output), show.png(picture, _about(seen_by)))
     else:
         asked = several or ([] if isovalue is None else [isovalue])
         _note_outside(light, field, asked)
@@ -131,12 +131,12 @@ def preview(
             _film(light, field, sweep, _drawn(light, field, local, split, options), seen_by)
         elif several:
             picture = show.strip(light, several, field, local=local, **options)
-            store.write_file(_given(output), show.png(picture, _about(seen_by)))
+            disk.write_file(_given(output), show.png(picture, _about(seen_by)))
         else:
             if trust and camera is None:  # the scale below leaves the picture another aspect
                 options |= look | {"camera": None}
             picture = _drawn(light, field, local, split, options)(isovalue)
-            store.write_file(_given(output), show.png(picture, _about(seen_by)))
+            disk.write_file(_given(output), show.png(picture, _about(seen_by)))
     if trust:
         from illumgrid.show.trust import doubts
 
@@ -267,7 +267,7 @@ def _film(
     light: "Illumination", field: str | None, sweep: tuple[int, Path], draw: Callable[[float | None], Any],
     camera: "Camera",
 ) -> None:  # fmt: skip
-    from illumgrid.io import store
+    from illumgrid.io import disk
     from illumgrid.show import png
     from illumgrid.show.film import film, frames
 
@@ -280,8 +280,8 @@ def _film(
                 yield picture
 
         if path.suffix:
-            store.write_file(path, film(list(reported()), path.suffix.lower()))
+            disk.write_file(path, film(list(reported()), path.suffix.lower()))
         else:
             about = _about(camera)
             pictures = ((f"{number:04}.png", png(picture, about)) for number, picture in enumerate(reported()))
-            store.write_folder(path, pictures)
+            disk.write_folder(path, pictures)

@@ -26,7 +26,7 @@ def view(
 ) -> None:
     """Sweep the isovalue interactively: in the browser, in a file to send, or in a window."""
     from illumgrid.chain import load
-    from illumgrid.io import store
+    from illumgrid.io import disk
 
     if export is not None and export.suffix.lower() not in (".html", ".htm"):
         raise BadInput(f"--export is {export.name!r}; expected a file name that ends in .html")
@@ -42,7 +42,7 @@ def view(
 
     text = page(light, up).encode()
     if export is not None:
-        store.write_file(export, text)
+        disk.write_file(export, text)
         say(f"wrote {export}, {len(text) / 1e6:.1f} MB: open it in any browser")
         return
     from illumgrid.show.viewer.server import serve

@@ -12,12 +12,11 @@ arrays lie in the world, how channels of light mix to RGB, and all else. Its ``c
 file: the EXR library never sees a damaged file, and a digit that changed is never taken for a result.
 """
 
+import errno
 import hashlib
 import json
 import os
-import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from math import prod
@@ -32,6 +31,8 @@ from illumgrid.errors import BadInput
 from illumgrid.field.scene import Field, Levels, Material, Quad, Scene
 from illumgrid.field.volume import Lattice, Volume
 from illumgrid.grid import RGB, Channels, GridSpec, IlluminationGrid, WallTexture
+from illumgrid.io import disk
+from illumgrid.io.disk import ELSEWHERE
 
 FORMAT = 2  # 1 had RGB only
 EXR, RUN, PREVIEW = "illumination.exr", "run.json", "preview.png"
@@ -39,7 +40,6 @@ PLACE = ("origin", "spacing", "direction")
 EDGES = ("corner", "edge_u", "edge_v")
 LAYOUT = "array (nx, ny, nz) = ({}, {}, {}); row = z*ny + y, column = x"
 DEFLATE_AT_MOST = 1032  # bytes out for one byte in: a file that claims more is refused before memory is asked for
-ELSEWHERE = "choose another folder"
 AGAIN = "give a folder that 'illumgrid run' wrote, or run it again"
 
 Image = NDArray[np.float32]
@@ -78,10 +78,9 @@ def claim(folder: str | os.PathLike[str], overwrite: bool) -> None:
     BadInput
         If it holds a finished run (unless `overwrite`) or anything that is not ours, or cannot be made or replaced.
     """
-    with _sentences(f"{folder} cannot be written to", ELSEWHERE):
+    with disk.sentences(f"{folder} cannot be written to", ELSEWHERE):
         place = Path(os.path.abspath(folder))
-        parent = next(p for p in place.parents if os.path.lexists(p))
-        tempfile.TemporaryDirectory(dir=parent, prefix=".").cleanup()  # permissions, quota, read-only: try it
+        disk.try_to_write(folder)
         try:
             place.lstat()
         except FileNotFoundError:
@@ -115,12 +114,11 @@ def write(folder: str | os.PathLike[str], stored: Stored, picture: bytes | None,
     """
     record = _describe(stored)
     claim(folder, overwrite)
-    with _sentences(f"{folder} could not be written; the disk may be full", ELSEWHERE):
+    with disk.sentences(f"{folder} could not be written; the disk may be full", ELSEWHERE):
         place = Path(os.path.abspath(folder))
-        place.parent.mkdir(parents=True, exist_ok=True)
-        hidden = f".{place.name[:50]}-"  # cut, or a long name would get too long
-        with tempfile.TemporaryDirectory(prefix=hidden, dir=place.parent, ignore_cleanup_errors=True) as work:
-            fresh = Path(work) / "new"
+        disk.make_parents(place)
+        with disk.beside(place) as work:
+            fresh = work / "new"
             fresh.mkdir()  # with the umask's mode; `work` is closed to others
             _write_exr(fresh / EXR, stored)
             _read_exr(fresh / EXR, _plan(record))  # the library flushes where it cannot report a full disk: look
@@ -129,7 +127,7 @@ def write(folder: str | os.PathLike[str], stored: Stored, picture: bytes | None,
             if picture is not None:
                 (fresh / PREVIEW).write_bytes(picture)
             claim(folder, overwrite)
-            _move(fresh, place, Path(work) / "old", overwrite)
+            disk.put(fresh, place, lambda fresh, place: _move(fresh, place, work / "old", overwrite))
 
 
 def amend(folder: str | os.PathLike[str], changes: Record) -> None:
@@ -141,21 +139,20 @@ def amend(folder: str | os.PathLike[str], changes: Record) -> None:
         If the record cannot be read, or written anew.
     """
     place = Path(os.path.abspath(folder))
-    with _sentences(f"{folder} could not be amended", AGAIN):
+    with disk.sentences(f"{folder} could not be amended", AGAIN):
         record = _read_record(place / RUN)
         record["recipe"].update(json.loads(json.dumps(changes, allow_nan=False)))
         record["checksum"] = _checksum(record, place / EXR)
-        with tempfile.TemporaryDirectory(prefix=f".{place.name[:50]}-", dir=place.parent) as work:
-            fresh = Path(work) / RUN
-            fresh.write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
-            fresh.replace(place / RUN)
+        with disk.beside(place) as work:
+            (work / "new.json").write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
+            disk.put(work / "new.json", place / RUN)
 
 
 def _move(fresh: Path, place: Path, old: Path, overwrite: bool) -> None:
     """Rename `fresh` to `place`; an older run there goes to `old`, and back if that fails.
 
-    A kill between the two renames leaves nothing at `place` and both runs whole in the hidden folder beside it: some
-    microseconds in which nothing is lost, not worth an atomic exchange that only Linux has.
+    A kill between the two renames leaves nothing at `place` and both runs whole in the hidden folder beside it, from
+    which `disk.sweep` puts the older one back: not worth an atomic exchange that only Linux has.
     """
     try:
         with suppress(OSError):  # only an empty folder goes
@@ -167,7 +164,7 @@ def _move(fresh: Path, place: Path, old: Path, overwrite: bool) -> None:
     except BaseException as reason:
         with suppress(OSError):
             old.rename(place)
-        if isinstance(reason, OSError) and place.exists():
+        if isinstance(reason, OSError) and reason.errno in (errno.EEXIST, errno.ENOTEMPTY) and place.exists():
             raise BadInput(f"{place} was taken by another run meanwhile; {ELSEWHERE}") from reason
         raise
 
@@ -181,32 +178,20 @@ def read(folder: str | os.PathLike[str]) -> Stored:
         If what the folder holds is not a whole and unchanged run of the format known here.
     """
     place = Path(folder)
+    if not place.exists():
+        disk.sweep(Path(os.path.abspath(place)))  # an older run that a killed writer had moved aside
     for name in (EXR, RUN):
         if not (place / name).is_file():
             raise BadInput(f"{place / name} is missing; {AGAIN}")
-    with _sentences(f"{place / RUN} is not the record of a run", AGAIN):
+    with disk.sentences(f"{place / RUN} is not the record of a run", AGAIN):
         record = _read_record(place / RUN)
         plan = _plan(record)
-    with _sentences(f"{place / EXR} cannot be used", AGAIN):
+    with disk.sentences(f"{place / EXR} cannot be used", AGAIN):
         if record["checksum"] != _checksum(record, place / EXR):
             raise BadInput(f"it, or {RUN} beside it, was damaged or changed since it was written")
         parts = _read_exr(place / EXR, plan)
-    with _sentences(f"{place / RUN} is not the record of a run", AGAIN):
+    with disk.sentences(f"{place / RUN} is not the record of a run", AGAIN):
         return _rebuild(record, parts)
-
-
-@contextmanager
-def _sentences(trouble: str, remedy: str) -> Iterator[None]:
-    """Turn whatever goes wrong into one sentence of what came and what to do."""
-    try:
-        yield
-    except BadInput as reason:
-        if str(reason).endswith((ELSEWHERE, remedy)):
-            raise
-        raise BadInput(f"{trouble}: {reason}; {remedy}") from reason
-    except Exception as reason:  # the EXR library raises RuntimeError, ValueError, UnicodeDecodeError...
-        what = reason.strerror if isinstance(reason, OSError) else f"{type(reason).__name__} {reason}"
-        raise BadInput(f"{trouble} ({what}); {remedy}") from reason
 
 
 def _describe(stored: Stored) -> Record:
@@ -384,58 +369,3 @@ def _read_exr(path: Path, plan: Plan) -> dict[str, dict[str, Image]]:
 def is_run(folder: str | os.PathLike[str]) -> bool:
     """Whether a folder looks like a finished run, rather than one of DICOM slices."""
     return (Path(folder) / RUN).is_file() or (Path(folder) / EXR).is_file()
-
-
-@contextmanager
-def fresh_file(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Give a place beside `path` to write a file to, and rename it in the end: whole, or not there.
-
-    Raises
-    ------
-    BadInput
-        If it cannot be written.
-    """
-    place = Path(path)
-    with _sentences(f"{path} could not be written", "choose another place"):
-        if place.is_dir():
-            raise BadInput(f"{path} is a folder; expected the name of a file")
-        place.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=f".{place.name[:50]}-", dir=place.parent) as work:
-            fresh = Path(work) / f"new{place.suffix}"  # libraries choose the format by the ending
-            yield fresh
-            fresh.replace(place)
-
-
-def write_file(path: str | os.PathLike[str], content: bytes) -> None:
-    """Write a file as `fresh_file` does."""
-    with fresh_file(path) as fresh:
-        fresh.write_bytes(content)
-
-
-def claim_new(path: str | os.PathLike[str]) -> None:
-    """Raise BadInput if something is at `path` already, but for an empty folder."""
-    place = Path(os.path.abspath(path))
-    if place.exists() and not (place.is_dir() and not any(place.iterdir())):
-        raise BadInput(f"{path} is there already; expected the name of a new folder: choose another")
-
-
-def write_folder(path: str | os.PathLike[str], files: Iterator[tuple[str, bytes]]) -> None:
-    """Write named files into a new folder beside its place and rename it: whole, or not there.
-
-    Raises
-    ------
-    BadInput
-        If something is there already, before the first file is asked for; or if it cannot be written.
-    """
-    claim_new(path)
-    place = Path(os.path.abspath(path))
-    with _sentences(f"{path} could not be written", "choose another place"):
-        place.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=f".{place.name[:50]}-", dir=place.parent) as work:
-            fresh = Path(work) / "new"
-            fresh.mkdir()
-            for name, content in files:
-                (fresh / name).write_bytes(content)
-            with suppress(OSError):
-                place.rmdir()
-            fresh.rename(place)

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from illumgrid.errors import BadInput, shown
-from illumgrid.io import store
+from illumgrid.io import disk
 from illumgrid.io.exports import arrays, surface, vti
 
 if TYPE_CHECKING:
@@ -97,7 +97,7 @@ def write(
     ending = Path(path).suffix.lower()
     if ending in SURFACES:
         lit = surface.lit(light, number, isovalue, progress)
-        with store.fresh_file(path) as fresh:
+        with disk.fresh_file(path) as fresh:
             SURFACES[ending](fresh, lit)
         progress("file", 1, 1)
         count = len(lit.mesh.faces)
@@ -105,7 +105,7 @@ def write(
         return f"isosurface {level} of {lit.field!r}, {count} triangles, exposure {lit.exposure:.4g}"
     names = (array or "irradiance",) if ending == ".nrrd" else arrays.NAMES
     points = arrays.points_of(light, number, on or "grid", names, progress)
-    with store.fresh_file(path) as fresh:
+    with disk.fresh_file(path) as fresh:
         LATTICES[ending](fresh, points, progress)
     shape = " x ".join(map(str, points.lattice.shape))
     where = "voxels" if on == "field" else "nodes"
