@@ -273,7 +273,7 @@ def test_options_of_stages_are_refused_their_nonsense(told):
         if entry.package != "illumgrid" or entry.missing():
             continue
         for option in options(entry.stage):
-            for value in [*WORDS, "-1", HUGE]:
+            for value in [*(NUMBERS if option.type is float else WORDS), "-1", HUGE]:
                 setting = f"{entry.kind}.{option.name}={value}"
                 args = ["run", *BASE["run"].split(), f"--{entry.kind}", entry.name, "--set", setting]
                 code, said, fresh = told(args)
