@@ -221,3 +221,32 @@ def test_one_warning_is_switched_off_by_its_name(recwarn):
 def test_every_warning_stands_on_its_page():
     page = (Path(__file__).parents[1] / "docs" / "stability.md").read_text("utf-8")
     assert all(f"| `{name}` |" in page for name in WARNINGS)
+
+
+# Smoothing as far as the noise asks
+
+
+def test_the_advised_blur_leaves_no_noise_and_takes_account_of_one_already_made():
+    def advice(volume, smoothed):
+        found = diagnose(Field("f", volume, range=(0.3, 1.5)), GridSpec.over(volume, 48), smoothed)
+        return next((f.options for f in found if f.name == "noise"), None)
+
+    loud = hills(noise=1.5)
+    asked = advice(loud, 0.0)
+    sigma = float(asked.removeprefix("--smooth "))
+    assert sigma > 1
+    assert advice(smooth(loud, 1.0), 1.0) == asked  # not --smooth 1 again: what the data need has not changed
+    assert advice(smooth(loud, sigma), sigma) is None
+
+
+def test_a_run_prints_the_command_that_smooths(call, tmp_path, monkeypatch):
+    np.save(tmp_path / "n.npy", hills(24, noise=0.2).values)
+    words = ["run", "n.npy", "--range", "0.3", "1.5", "--grid", "8", "--paths", "1", "--bounces", "1", "--no-preview"]
+    monkeypatch.setattr("sys.argv", ["illumgrid", *words, "--smooth", "0.1"])
+    said = call(*words, "--smooth", "0.1")
+    (line,) = [line for line in said.splitlines() if "illumgrid run" in line]
+    assert line.split("illumgrid ")[1].startswith(" ".join(words)) and line.count("--smooth") == 1
+    assert "--smooth 0.1" not in line and line.endswith("--overwrite")
+    again = line.split("illumgrid ")[1].split()
+    assert "illumgrid run" not in call(*again)
+    assert "illumgrid run" not in call(*words, "--overwrite", "--ignore", "noise")

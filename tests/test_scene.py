@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 
 from illumgrid.errors import IllumgridWarning
-from illumgrid.field.scene import Field, Material, Scene, level_table, suggest_range
+from illumgrid.field.boundaries import suggest_range
+from illumgrid.field.scene import Field, Material, Scene, level_table
+from illumgrid.field.signed import has_both_signs, suggest_magnitudes
 from illumgrid.field.volume import Volume
 from illumgrid.io.readers import read_volume
 from shapes import DIRECTIONS, MIRRORED, OBLIQUE, ball, refused, sky
@@ -104,18 +106,15 @@ def test_a_field_is_found_by_its_name():
 
 
 @pytest.mark.parametrize("inside, share", [("above", 0.1), ("below", 0.9)])
-def test_the_suggested_range_parts_two_modes_and_reaches_into_the_object(inside, share):
-    random = np.random.default_rng(0)
-    mode = np.where(random.random((30, 30, 30)) < 0.1, 100, 10)
-    values = random.normal(mode, 5)
+def test_the_suggested_range_holds_the_boundary_between_two_modes(inside, share):
+    mode = np.where(((np.indices((30, 30, 30)) - 14.7) ** 2).sum(axis=0) < 8.64**2, 100, 10)  # 0.1 of the volume
+    values = np.random.default_rng(0).normal(mode, 5)
     low, high, why = suggest_range(Volume(values), inside)
-    threshold, deep = (low, high) if inside == "above" else (high, low)
-    assert 25 < threshold < 85  # between the modes, which end at 10 + 3 sigma and 100 - 3 sigma
-    solid = values > threshold if inside == "above" else values < threshold
+    middle = 0.5 * (low + high)
+    assert 25 < middle < 85  # between the modes, which end at 10 + 3 sigma and 100 - 3 sigma
+    solid = values > middle if inside == "above" else values < middle
     assert solid.mean() == pytest.approx(share, abs=0.01)
-    beyond = values[solid] > deep if inside == "above" else values[solid] < deep
-    assert beyond.mean() == pytest.approx(0.5, abs=0.01)
-    assert "Otsu" in why and f"{threshold:.4g}" in why and f"{deep:.4g}" in why and inside in why
+    assert low < 50 < high and "the boundary of the object" in why
 
 
 def test_the_suggestion_for_below_is_that_for_above_of_the_opposite_field():
@@ -164,10 +163,20 @@ def known_isovalues():
 
 
 @pytest.mark.skipif(not VOLUMES.is_dir(), reason=f"no real volumes at {VOLUMES}")
-@pytest.mark.parametrize("file", ["stroke_T1.nii.gz", "nucleon.nrrd", "vis_male.nrrd", "neghip.nrrd"])
-def test_the_suggestion_for_real_data_is_among_the_known_isovalues(file):
-    low, high, _ = suggest_range(read_volume(VOLUMES / file))
-    assert any(low <= last and high >= first for first, last in known_isovalues()[file])
+@pytest.mark.parametrize("file", sorted(known_isovalues()) if VOLUMES.is_dir() else [])
+def test_the_suggestion_for_real_data_holds_the_known_isovalues(file):
+    """Of every known surface (skin, bone) some isovalues are in the range, which keeps away from the ends of the data.
+
+    The middle, which pictures show, is not beyond all of them. For thin structures it is near the low end.
+    """
+    volume, known = read_volume(VOLUMES / file), known_isovalues()[file]
+    low, high, _ = (suggest_magnitudes if has_both_signs(volume) else suggest_range)(volume)
+    assert all(low <= last and high >= 0.95 * first for first, last in known)
+    lowest, highest = volume.extremes
+    assert lowest < low and high < 0.95 * highest + 0.05 * lowest + 1e-6
+    assert not known or 0.5 * (low + high) < 1.15 * max(last for _, last in known)
+    if file == "rivulet_neuron.nrrd":
+        assert low < 14
 
 
 # The sweep

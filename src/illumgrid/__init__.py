@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from illumgrid.chain import load, run
     from illumgrid.errors import BadInput, IllumgridWarning
+    from illumgrid.field.boundaries import suggest_range
     from illumgrid.field.levelset import isosurface
-    from illumgrid.field.scene import Field, Levels, Material, Quad, Scene, suggest_range
+    from illumgrid.field.scene import Field, Levels, Material, Quad, Scene
     from illumgrid.field.volume import Volume
     from illumgrid.grid import GridSpec, IlluminationGrid, WallTexture
     from illumgrid.io.readers import read_scene, read_volume
@@ -56,7 +57,8 @@ _HOMES = {
     "chain": ("load", "run"),
     "errors": ("BadInput", "IllumgridWarning"),
     "field.levelset": ("isosurface",),
-    "field.scene": ("Field", "Levels", "Material", "Quad", "Scene", "suggest_range"),
+    "field.boundaries": ("suggest_range",),
+    "field.scene": ("Field", "Levels", "Material", "Quad", "Scene"),
     "field.volume": ("Volume",),
     "grid": ("GridSpec", "IlluminationGrid", "WallTexture"),
     "io.readers": ("read_scene", "read_volume"),

@@ -1,5 +1,7 @@
 """``illumgrid run``: the whole chain, from a volume or a scene to a finished folder."""
 
+import shlex
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -242,8 +244,10 @@ def run(
         for field in scene.fields:
             shape = " x ".join(map(str, field.volume.shape))
             say(f"{field.name}: {shape} voxels, isovalues {shown_range(field.range)}")
-            for finding in diagnose(field, nodes_over(field.volume, grid)):
+            for finding in diagnose(field, nodes_over(field.volume, grid), smooth or 0.0):
                 tell(finding.name, finding.sentence)
+                if finding.name == "noise" and "noise" not in (ignore or []):
+                    say(f"  smoothed that far: {_again(finding.options)}")
         if backend == "auto":
             say(_why_auto())
         with progress_bars() as progress:
@@ -281,6 +285,8 @@ def _judged(light: "Illumination", stages: dict[str, Any], folder: Path) -> "Ill
 
 def _advise(light: "Illumination", stages: dict[str, Any]) -> None:
     """Where more paths would not help much, say what would."""
+    import numpy as np
+
     from illumgrid.accuracy.judge import remedies
 
     recipe = light.recipe
@@ -297,8 +303,18 @@ def _advise(light: "Illumination", stages: dict[str, Any]) -> None:
     if found["finer"] < 0.8 * found["now"]:
         text += f"; --grid {2 * recipe['grid']} would reduce that to {found['finer']:.1%}"
     if found["smooth"] < 0.8 * found["now"]:
-        text += f"; --smooth 1, which lights a field without its noise, to {found['smooth']:.1%}"
+        smooth = np.hypot(recipe.get("smooth", 0.0), 1.0)  # by a voxel more: variances of blurs add up
+        text += f"; --smooth {smooth:.2g}, which lights a field without its noise, to {found['smooth']:.1%}"
     tell("grid", text)
+
+
+def _again(options: str) -> str:
+    """The command line of this process, with another blur, in place of its result."""
+    words = ["illumgrid", *sys.argv[1:]]
+    for at in [k for k, word in enumerate(words) if word == "--smooth"]:
+        words[at : at + 2] = []
+    words = [word for word in words if not word.startswith("--smooth=") and word != "--overwrite"]
+    return f"{shlex.join(words)} {options} --overwrite"
 
 
 def _report(light: "Illumination", folder: Path, picture: bool) -> None:

@@ -23,6 +23,7 @@ _SIDE = 64  # voxels along the longest axis of the field on which they are count
 
 
 _ROUGH = 0.5  # normals that turn this much from voxel to voxel are rough (see `turning`)
+_BLURS = (1.0, 1.5, 2.0, 3.0, 4.0)  # voxels; the first that leaves no rough normals is advised
 _SOOTHED = 0.8  # ... and if a blur by one voxel brings them to this share, it is noise and not shape
 _FLOOR = 0.12  # over turning²; within a factor of two on raw and blurred volumes of ten kinds (docs/stability.md)
 _FALLS = 0.7  # the power of nodes per voxel with which that falls; 0.5 to 0.8 on most (docs/speed_and_accuracy.md)
@@ -42,10 +43,13 @@ class Finding:
         One of `illumgrid.errors.WARNINGS`.
     sentence : str
         What was found and where, and what to do.
+    options : str
+        Of ``illumgrid run``, such as ``--smooth 1``, if they are what to do.
     """
 
     name: str
     sentence: str
+    options: str = ""
 
 
 def plateaus(volume: Volume) -> list[tuple[float, float, Floats]]:
@@ -189,19 +193,25 @@ def floor_of(turn: float, density: float = 1.0) -> float:
     return float(_FLOOR * turn**2 / density**_FALLS)
 
 
-def _noise(field: Field, spec: GridSpec) -> Iterator[Finding]:
+def _noise(field: Field, spec: GridSpec, smoothed: float) -> Iterator[Finding]:
     density = max(spec.shape) / max(field.volume.shape)
     turn = turning(field.volume, *field.stored_range)
     if turn < _ROUGH:
         return
-    after = turning(smooth(field.volume, 1.0), *field.stored_range)
+    after = turn
+    for sigma in (s for s in _BLURS if s > smoothed):  # of the data as they came: variances of blurs add up
+        blurred = smooth(field.volume, min(np.sqrt(sigma**2 - smoothed**2), max(field.volume.shape)))
+        after = turning(blurred, *field.stored_range)
+        if after < _ROUGH or after >= _SOOTHED * turn:
+            break
     if after < _SOOTHED * turn:
         yield Finding(
             "noise",
             f"normals of field {field.name!r} turn by {2 * np.degrees(np.arcsin(min(turn / 2, 1))):.0f} degrees from "
             f"voxel to voxel: on a grid of {max(spec.shape)} nodes the light keeps an error of about "
-            f"{floor_of(turn, density):.0%} at any number of paths; --smooth 1 would reduce it to about "
+            f"{floor_of(turn, density):.0%} at any number of paths; --smooth {sigma:g} would reduce it to about "
             f"{floor_of(after, density):.0%}",
+            f"--smooth {sigma:g}",
         )
 
 
@@ -306,12 +316,12 @@ def _labels(field: Field) -> Iterator[Finding]:
         )
 
 
-def diagnose(field: Field, spec: GridSpec) -> list[Finding]:
-    """All that warns of a field under its range and the grid that is meant for it."""
+def diagnose(field: Field, spec: GridSpec, smoothed: float = 0.0) -> list[Finding]:
+    """All that warns of a field under its range and the grid meant for it, which was blurred by `smoothed` voxels."""
     found = [
         *_labels(field),
         *_plateau(field),
-        *_noise(field, spec),
+        *_noise(field, spec, smoothed),
         *_thin(field, spec),
         *_border(field),
         *_empty(field),

@@ -5,7 +5,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from illumgrid.errors import BadInput, shown, shown_range
+from illumgrid.errors import BadInput, shown_range
+from illumgrid.field.boundaries import suggest_range
 from illumgrid.field.volume import UPWARD, Floats, Side, Volume, finite, index_to_world
 
 
@@ -38,59 +39,6 @@ class Material:
     def __post_init__(self) -> None:
         object.__setattr__(self, "albedo", _rgb(self.albedo, "albedo", 1.0))
         object.__setattr__(self, "emission", _rgb(self.emission, "emission", np.inf))
-
-
-def suggest_range(volume: Volume, inside: Side = "above") -> tuple[float, float, str]:
-    """Suggest a range of isovalues from the histogram, with the reason.
-
-    Returns
-    -------
-    low, high : float
-        One end is Otsu's threshold between background and object; the other leaves the innermost half of the object
-        inside. With `inside` "below" the same is done for -h.
-    why : str
-        The reason, one sentence with the numbers.
-
-    Raises
-    ------
-    BadInput
-        If the values are constant: no level set is a surface.
-
-    References
-    ----------
-    .. [1] N. Otsu, "A threshold selection method from gray-level histograms", IEEE Trans. SMC 9(1), 1979.
-    """
-    from skimage.filters import threshold_otsu
-
-    # np.float64, not float: for float32 values NumPy would compute the edges in float32, which is too coarse far from
-    # 0.
-    lowest, highest = np.float64(np.nanmin(volume.values)), np.float64(np.nanmax(volume.values))
-    if not (np.isfinite(lowest) and np.isfinite(highest)):
-        volume = finite(volume, inside)
-        lowest, highest = np.float64(volume.values.min()), np.float64(volume.values.max())
-    if lowest == highest:
-        raise BadInput(
-            f"the values are all {volume.in_units(lowest):g}; expected a field that varies, or there is no isosurface"
-        )
-    counts, edges = np.histogram(volume.values, 1024, (lowest, highest))
-    depth = 0.5 * (edges[1:] + edges[:-1])
-    if inside == "below":
-        counts, depth = counts[::-1], -depth[::-1]
-    sign = UPWARD[inside]
-    threshold = float(threshold_otsu(hist=(counts, depth)))
-    within = np.where(depth > threshold, counts, 0)
-    # The bin that contains the median of the object, at least one bin deeper than the threshold.
-    deep = float(
-        depth[max(np.searchsorted(np.cumsum(within), 0.5 * within.sum()), np.searchsorted(depth, threshold) + 1)]
-    )
-    share = within.sum() / counts.sum()
-    at, half = (float(volume.in_units(sign * x)) for x in (threshold, deep))
-    low, high = sorted((at, half))
-    why = (
-        f"Otsu's threshold {shown(at, volume.extremes)} separates object ({share:.1%} of the voxels) and background, "
-        f"and half of the object lies {inside} {shown(half, volume.extremes)}"
-    )
-    return low, high, why
 
 
 @dataclass(frozen=True, eq=False)

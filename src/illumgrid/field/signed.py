@@ -6,8 +6,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from illumgrid.errors import BadInput, shown_range, tell
+from illumgrid.field.boundaries import suggest_range
 from illumgrid.field.labels import COLOURS
-from illumgrid.field.scene import Field, Material, suggest_range
+from illumgrid.field.scene import Field, Material
 from illumgrid.field.volume import Volume
 
 POSITIVE, NEGATIVE = COLOURS[1], COLOURS[2]

@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from illumgrid.errors import BadInput
+from illumgrid.field.boundaries import otsu_threshold
 from illumgrid.field.levelset import turned, turned_levels
-from illumgrid.field.scene import Scene, suggest_range
+from illumgrid.field.scene import Scene
 from illumgrid.field.volume import Floats, box_corners, index_to_world
 
 HALF_ANGLE = 0.27  # tangent of half the vertical angle of view, 30 degrees in all
@@ -105,10 +106,9 @@ def up_of(scene: Scene) -> str:
     if stated or scene.quads or len(scene.fields) > 1:
         return "z"
     try:
-        low, high, _ = suggest_range(first.volume, first.inside)
+        level = first.volume.to_stored(otsu_threshold(first.volume, first.inside))
     except BadInput:  # constant
         return "z"
-    level = first.volume.to_stored(low if first.upward > 0 else high)
     areas = first.solid(first.volume.values, level).sum(axis=(0, 1))
     ends = areas[areas > 0][[0, -1]] / areas.max()
     return "-z" if ends[1] > FLAT and ends[0] < ROUND else "z"

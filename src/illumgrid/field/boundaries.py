@@ -1,0 +1,233 @@
+"""Boundaries between the classes that the data hold (air, skin, bone), and the range of isovalues that contains them.
+
+At a boundary the slope is greatest across it: there the second derivative along the gradient vanishes (G. Kindlmann and
+J. Durkin, "Semi-automatic generation of transfer functions for direct volume rendering", VolVis 1998; J. Canny, "A
+computational approach to edge detection", PAMI 8(6), 1986). The values at such voxels say which isovalues people look
+for: those whose surfaces are steep.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from illumgrid.errors import BadInput, shown
+from illumgrid.field.volume import UPWARD, Floats, Side, Volume, finite
+
+_VOXELS = 1 << 22  # that are looked at, in slabs spread over the volume
+_SLAB, _MARGIN = 16, 4  # slices of a slab, and of what the blur needs around it
+_BLUR = 1.0  # voxels, against noise
+_FLAT = 0.003  # of the steepest slope: what is flatter is not looked at
+_STEEP = 0.05, 0.15  # of the slope of the steep boundaries: what is flatter is noise, without and with a background
+_NOISE = 4.0  # over the slopes of four fifths of the background: what is steeper is no noise
+_RIDGE = 1e-3  # by which a slope exceeds those a voxel ahead and behind, relative
+_FEWEST = 64  # boundary voxels from which a range is taken
+_OUTER, _INNER = 0.02, 0.8  # shares of the boundaries above which a range begins, and of their slopes, where it ends
+_THIN = 1 / 3  # share of the voxels of a solid whose six neighbours belong to it, below which it is of thin fibres
+_VALLEY, _FLANK = 0.7, 0.5  # density of boundaries, over that of the lower peak beside it, and of the nearest peak
+_BINS = 64  # of the density of the boundaries' values
+_INSIDE = 0.05  # of the span of the data, by which a range stays away from their ends
+
+
+def suggest_range(volume: Volume, inside: Side = "above") -> tuple[float, float, str]:
+    """Suggest a range of isovalues that contains the boundaries of the data's classes, with the reason.
+
+    Returns
+    -------
+    low, high : float
+        Nearly all boundaries lie above the outer end, and four fifths of their slopes before the inner end. Where the
+        middle would be between two boundaries (inside soft tissue, where surfaces are noise), the range is moved until
+        its middle is at the deeper one. Boundaries of fibres lie at half of what they reach, from faint to bright: if
+        the object at the middle is thin, the middle becomes the geometric mean of the ends, where fibres hang together.
+        Fields without boundaries (too small, or of one slope) get Otsu's threshold [1]_ and the median of what lies
+        inside it. With `inside` "below" the same is done for -h.
+    why : str
+        The reason, one sentence with the numbers.
+
+    Raises
+    ------
+    BadInput
+        If the values are constant: no level set is a surface.
+
+    References
+    ----------
+    .. [1] N. Otsu, "A threshold selection method from gray-level histograms", IEEE Trans. SMC 9(1), 1979.
+    """
+    volume = _varying(volume, inside)
+    value, slope = _boundary_voxels(volume, inside)
+    if len(value) < _FEWEST:
+        return _from_histogram(volume, inside)
+    order = np.argsort(value, kind="stable")
+    upto = np.cumsum(slope[order])
+    steepest = value[order][np.searchsorted(upto, _INNER * upto[-1])]
+    ends = np.clip([np.quantile(value, _OUTER), steepest], _INSIDE, 1 - _INSIDE)
+    outer, inner = np.clip(_around_a_boundary(_density(value), *ends), _INSIDE, 1 - _INSIDE)
+    if _thickness(volume, _in_units(volume, inside, [0.5 * (outer + inner)])[0], inside) < _THIN:
+        inner = min(inner, 2 * np.sqrt(outer * inner) - outer)
+    if inner - outer < _INSIDE:  # a step: its surfaces are the same
+        outer, inner = np.clip(0.5 * (outer + inner) + 0.5 * _INSIDE * np.array([-1, 1]), 0, 1)
+    at = [shown(x, volume.extremes, 3) for x in sorted(_in_units(volume, inside, _peaks(_density(value))))]
+    low, high = sorted(_in_units(volume, inside, [outer, inner]))
+    plural = "boundaries between classes of the data lie" if len(at) > 1 else "the boundary of the object lies"
+    return low, high, f"{plural} around {', '.join(at)}, where surfaces are steep"
+
+
+def boundaries(volume: Volume, inside: Side = "above") -> list[float]:
+    """Isovalues at which most surfaces are steep, one for each boundary between classes; lowest first."""
+    volume = _varying(volume, inside)
+    value, _ = _boundary_voxels(volume, inside)
+    return sorted(_in_units(volume, inside, _peaks(_density(value)))) if len(value) >= _FEWEST else []
+
+
+def otsu_threshold(volume: Volume, inside: Side = "above") -> float:
+    """Otsu's isovalue between background and object."""
+    counts, depth = _histogram(_varying(volume, inside), inside)
+    return float(volume.in_units(UPWARD[inside] * _otsu(counts, depth)))
+
+
+def _varying(volume: Volume, inside: Side) -> Volume:
+    lowest, highest = np.float64(volume.values.min()), np.float64(volume.values.max())
+    if not (np.isfinite(lowest) and np.isfinite(highest)):
+        volume = finite(volume, inside)
+        lowest, highest = np.float64(volume.values.min()), np.float64(volume.values.max())
+    if lowest == highest:
+        raise BadInput(
+            f"the values are all {volume.in_units(lowest):g}; expected a field that varies, or there is no isosurface"
+        )
+    return volume
+
+
+def _in_units(volume: Volume, inside: Side, depth: Floats | list[float]) -> list[float]:
+    """Isovalues at shares of the span of the data, which count inward."""
+    low, high = (float(x) for x in (volume.values.min(), volume.values.max()))
+    share = np.asarray(depth) if UPWARD[inside] > 0 else 1 - np.asarray(depth)
+    return [float(x) for x in np.asarray(volume.in_units(low + share * (high - low)))]
+
+
+def _slabs(volume: Volume, inside: Side) -> list[tuple[NDArray[np.float32], slice]]:
+    """Blurred slabs along x, their values from 0 outside to 1 inside, and the slices that count."""
+    from scipy.ndimage import gaussian_filter
+
+    v = volume.values
+    low, high = (float(x) for x in (v.min(), v.max()))
+    every = max(1, int(np.ceil(v.size / _VOXELS)))
+    found = []
+    for first in range(0, v.shape[0], _SLAB * every):
+        begin = max(0, first - _MARGIN)
+        part = (v[begin : first + _SLAB + _MARGIN].astype(float) - low) / (high - low)
+        part = part if UPWARD[inside] > 0 else 1 - part
+        counted = slice(first - begin, min(first + _SLAB, v.shape[0]) - begin)
+        found.append((gaussian_filter(part.astype(np.float32), _BLUR, mode="nearest"), counted))
+    return found
+
+
+def _boundary_voxels(volume: Volume, inside: Side) -> tuple[Floats, Floats]:
+    """Values, as shares of the span, and slopes (n,) of voxels steeper than those before and behind, and than noise."""
+    from scipy.ndimage import map_coordinates
+
+    counts, depth = _histogram(volume, inside)
+    sign, (low, high) = UPWARD[inside], (float(x) for x in (volume.values.min(), volume.values.max()))
+    threshold = (_otsu(counts, depth) - min(sign * low, sign * high)) / (high - low)
+    ground, value, slope, step = [], [], [], volume.spacing / volume.spacing.min()
+    for part, counted in _slabs(volume, inside):
+        gradient = np.stack(
+            [np.gradient(part, np.float32(s), axis=a) if part.shape[a] > 1 else 0 * part for a, s in enumerate(step)]
+        )
+        length = np.sqrt(np.square(gradient).sum(axis=0))
+        ground.append(length[counted][part[counted] < threshold])
+        within = np.zeros(part.shape, bool)
+        within[counted] = length[counted] > _FLAT * length.max()
+        index = np.argwhere(within)
+        own = length[within]
+        along = gradient[:, within].T / step
+        along /= np.abs(along).max(axis=1, keepdims=True)
+        ahead, behind = (map_coordinates(length, (index + s * along).T, order=1, mode="nearest") for s in (1, -1))
+        ridge = own > (1 + _RIDGE) * np.maximum(ahead, behind)
+        value.append(part[within][ridge])
+        slope.append(own[ridge])
+    values, slopes, flat = (np.concatenate(parts).astype(float) for parts in (value, slope, ground))
+    if len(slopes) < _FEWEST:
+        return values, slopes
+    by_slope = np.sort(slopes)
+    upto = np.cumsum(by_slope)
+    strong = by_slope[min(np.searchsorted(upto, 0.9 * upto[-1]), len(by_slope) - 1)]
+    noise = _NOISE * float(np.quantile(flat, 0.8)) if len(flat) else 0.0
+    steep = slopes > np.clip(noise, _STEEP[0] * strong, _STEEP[1] * strong)
+    return values[steep], slopes[steep]
+
+
+def _density(value: Floats) -> Floats:
+    """Of the boundaries' values in `_BINS` bins of the span; the greatest is 1."""
+    from scipy.ndimage import gaussian_filter1d
+
+    counts, _ = np.histogram(value, _BINS, (0, 1))
+    smooth = gaussian_filter1d(counts.astype(float), 1.5, mode="constant")
+    return np.asarray(smooth / smooth.max())
+
+
+def _around_a_boundary(density: Floats, outer: float, inner: float) -> tuple[float, float]:
+    """The range, or, if its middle is in a valley between two boundaries, one around the deeper of them.
+
+    The new range still begins before the outer boundary.
+    """
+    here = min(int(0.5 * (outer + inner) * _BINS), _BINS - 1)
+    shallow, deeper = density[: here + 1], density[here:]
+    if density[here] >= _VALLEY * min(shallow.max(), deeper.max()):
+        return outer, inner
+    middle = (here + int(np.argmax(deeper >= _FLANK * deeper.max())) + 1) / _BINS
+    outer = max(outer, int(np.argmax(shallow >= _FLANK * shallow.max())) / _BINS)
+    return outer, max(inner, 2 * middle - outer)
+
+
+def _peaks(density: Floats) -> list[float]:
+    """Shares of the span at which boundaries are densest, each with a valley to the next."""
+    from scipy.signal import find_peaks
+
+    padded = np.pad(density, 1)
+    found, about = find_peaks(padded, height=0.1, prominence=0.1)
+    return [(int(k) - 0.5) / _BINS for k in found[about["prominences"] > 0.5 * padded[found]]]
+
+
+def _thickness(volume: Volume, isovalue: float, inside: Side) -> float:
+    """Share of the solid's voxels whose six neighbours belong to it, too; 1 without any."""
+    sign = UPWARD[inside]
+    solid = sign * volume.values >= sign * volume.to_stored(isovalue)
+    within = solid[1:-1, 1:-1, 1:-1]
+    total, deep = int(within.sum()), within.copy()
+    for axis in range(3):
+        for part in (slice(0, -2), slice(2, None)):
+            at = [slice(1, -1)] * 3
+            at[axis] = part
+            deep &= solid[tuple(at)]
+    return int(deep.sum()) / total if total else 1.0
+
+
+def _histogram(volume: Volume, inside: Side) -> tuple[NDArray[np.int64], Floats]:
+    """Counts of voxels and the middles of the bins, upwards."""
+    # np.float64, not float: for float32 values NumPy would compute the edges in float32, too coarse far from 0.
+    ends = np.float64(volume.values.min()), np.float64(volume.values.max())
+    counts, edges = np.histogram(volume.values, 1024, ends)
+    depth = 0.5 * (edges[1:] + edges[:-1])
+    return (counts, depth) if UPWARD[inside] > 0 else (counts[::-1], -depth[::-1])
+
+
+def _otsu(counts: NDArray[np.int64], depth: Floats) -> float:
+    from skimage.filters import threshold_otsu
+
+    return float(threshold_otsu(hist=(counts, depth)))
+
+
+def _from_histogram(volume: Volume, inside: Side) -> tuple[float, float, str]:
+    counts, depth = _histogram(volume, inside)
+    threshold = _otsu(counts, depth)
+    within = np.where(depth > threshold, counts, 0)
+    # The bin that contains the median of the object, at least one bin deeper than the threshold.
+    deep = float(
+        depth[max(np.searchsorted(np.cumsum(within), 0.5 * within.sum()), np.searchsorted(depth, threshold) + 1)]
+    )
+    share = within.sum() / counts.sum()
+    at, half = (float(volume.in_units(UPWARD[inside] * x)) for x in (threshold, deep))
+    low, high = sorted((at, half))
+    why = (
+        f"Otsu's threshold {shown(at, volume.extremes)} separates object ({share:.1%} of the voxels) and background, "
+        f"and half of the object lies {inside} {shown(half, volume.extremes)}"
+    )
+    return low, high, why
