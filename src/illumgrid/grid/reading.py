@@ -16,6 +16,7 @@ TURN = 0.2  # of 1 - n·n': the weight falls to 1/e there, at 37 degrees, and to
 RIDGE = 0.1  # of the weights' sum, in squared spacings: what holds back slopes that the samples do not tell
 NEGLIGIBLE = 14.0  # a weight e^-14 of the largest is none
 NEAREST = 0.499  # spacings within which a hole of the lit lattice makes a hole; halfway the others decide
+REACH = 2.0 - 1e-4  # spacings along each axis from which on a sample has no weight
 MOST = 512  # samples that one point reads, at most
 
 
@@ -99,8 +100,8 @@ def estimate(start, place, light, variance, shape, u, level, normal, log, weight
         for b in range(low1, high1 + 1):
             row = (a * shape[1] + b) * shape[2]
             for i in range(start[row + low2], start[row + high2 + 1]):
-                hats = hat(place[i, 0] - u[0]) * hat(place[i, 1] - u[1]) * hat(place[i, 2] - u[2])
-                if hats <= 1e-12 or count == MOST:
+                x, y, z = place[i, 0] - u[0], place[i, 1] - u[1], place[i, 2] - u[2]
+                if max(abs(x), abs(y), abs(z)) >= REACH or count == MOST:
                     continue
                 delta, slope = abs(place[i, 3] - level), place[i, 7]
                 if delta >= 1e6 * slope:
@@ -108,11 +109,13 @@ def estimate(start, place, light, variance, shape, u, level, normal, log, weight
                         continue
                     slope = 1.0
                 delta /= LEVEL * slope
+                if -0.5 * delta * delta < top - NEGLIGIBLE:
+                    continue
                 cosine = place[i, 4] * normal[0] + place[i, 5] * normal[1] + place[i, 6] * normal[2]
                 exponent = -0.5 * delta * delta - (1.0 - cosine) / TURN
                 if exponent < top - NEGLIGIBLE:
                     continue
-                log[count], weights[count], near[count] = exponent, hats / slope, i
+                log[count], weights[count], near[count] = exponent, hat(x) * hat(y) * hat(z) / slope, i
                 top = max(top, exponent)
                 count += 1
     if count == 0:
