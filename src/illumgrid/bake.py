@@ -19,7 +19,7 @@ from illumgrid.samplers.direct import Direct
 from illumgrid.stages import Interpolator, Sampler
 from illumgrid.transport.samples import Queries, Samples, combine, join_queries, join_samples
 from illumgrid.transport.stages import fill_nodes
-from illumgrid.transport.tracer import Tracer
+from illumgrid.transport.tracer import Tracer, answered
 
 Progress = Callable[[str, int, int], None]
 """Called with what is being done, how much of it is done, and how much there is."""
@@ -93,12 +93,22 @@ class Bake:
         """Walk the paths with these numbers from every target as well; see `bake` for `map` and `progress`."""
         work = [(q, range(n * paths.start, n * paths.stop)) for q, n in zip(self.targets, self.weights)]
         what, done, total = "more light" if self.answers else "light", 0, sum(len(q) for q in self.targets)
-        new = []
+        new, within = [], 0
+
+        def tick(count: int) -> None:
+            nonlocal within
+            within += count
+            progress(what, min(done + within, total), total)
+
         progress(what, 0, total)
-        for answer in map(partial(_answer, tracer, self.bounces, self.seed), work):
-            new.append(answer)
-            done += len(answer)
-            progress(what, done, total)
+        before = answered.set(tick)
+        try:
+            for answer in map(partial(_answer, tracer, self.bounces, self.seed), work):
+                new.append(answer)
+                done, within = done + len(answer), 0
+                progress(what, done, total)
+        finally:
+            answered.reset(before)
         # The answers bring their queries with them: a large run holds its targets once.
         return self.merge(replace(self, targets=tuple(a.queries for a in new), answers=tuple(new), walked=(paths,)))
 

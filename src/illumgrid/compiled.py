@@ -6,6 +6,7 @@ it does not notice damage within machine code.
 
 import contextlib
 import hashlib
+import logging
 import pickle
 from collections.abc import Callable
 from typing import Any
@@ -15,6 +16,9 @@ from numba.core.caching import CompileResultCacheImpl, FunctionCache
 from numba.core.serialize import dumps
 
 from illumgrid.errors import tell
+
+log = logging.getLogger(__name__)
+"""Has the name of each function as its compilation begins."""
 
 _said: set[str] = set()
 
@@ -55,12 +59,14 @@ class _Cache(FunctionCache):
     def load_overload(self, signature: Any, context: Any) -> Any:
         """Compiled code from the disk, or None."""
         try:
-            return super().load_overload(signature, context)
+            if (kept := super().load_overload(signature, context)) is not None:
+                return kept
         except Exception as problem:  # whatever unpickling makes of damaged bytes
             _say("compiled code on the disk cannot be read and is made anew", problem)
             with contextlib.suppress(OSError):
                 self.flush()
-            return None
+        log.info("%s", self._py_func.__qualname__)
+        return None
 
     def save_overload(self, signature: Any, compiled: Any) -> None:
         """Keep compiled code, if that is possible."""

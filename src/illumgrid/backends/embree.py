@@ -145,10 +145,12 @@ def grow(vertices: Floats, faces: Ints) -> Any:
     return scene
 
 
-def by_embree(scene: Any, meshes: Sequence[LevelMesh]) -> Cast:
-    """How embreex casts rays."""
+def by_embree(scene: Any, meshes: Sequence[LevelMesh], stop: NDArray[np.uint8]) -> Cast:
+    """How embreex casts rays, until `stop` (1,) is set."""
 
     def cast(f: int, x: Floats, d: Floats) -> tuple[Floats, Ints]:
+        if stop[0]:  # the caller's thread has seen Ctrl-C
+            raise KeyboardInterrupt
         tree = meshes[f].tree
         if tree is None or not len(x):
             return np.full(len(x), np.inf), np.full(len(x), -1)
@@ -206,7 +208,7 @@ class EmbreeTracer:
     channels: Channels
     fields: Marchable
     meshes: Meshes
-    threads: ThreadPoolExecutor | None
+    threads: ThreadPoolExecutor
 
     def __reduce__(self) -> tuple[Any, ...]:
         return self.backend.prepare, (self.scene,)
@@ -219,6 +221,7 @@ class EmbreeTracer:
         count = np.zeros(n, np.int32)
         if n and len(paths):
             point, normal, level = in_frame(self.scene, queries)
+            stop = np.zeros(1, np.uint8)
             with np.errstate(over="ignore"):
                 key = stream(np.uint64(seed), queries.id)
 
@@ -229,15 +232,15 @@ class EmbreeTracer:
                 )
                 mean[rows], m2[rows], count[rows] = light, spread, np.where(good, len(paths), 0)
 
-            share(self.threads, chunk, self._pieces(queries.level))
+            share(self.threads, chunk, self._pieces(queries.level, stop), stop)
         return Samples(queries, mean, m2, count, self.channels)
 
-    def _pieces(self, level: Floats) -> Iterator[tuple[Casting, NDArray[np.int64]]]:
+    def _pieces(self, level: Floats, stop: NDArray[np.uint8]) -> Iterator[tuple[Casting, NDArray[np.int64]]]:
         """What the rays meet, and queries for which it does."""
         for row, members in row_groups(self.scene, level):
             meshes = self.meshes.of(row)
             layout = meshed(self.fields, meshes)
-            surfaces = Casting(layout, by_embree(layout, meshes))
+            surfaces = Casting(layout, by_embree(layout, meshes, stop))
             for i in range(0, len(members), 1024):
                 yield surfaces, members[i : i + 1024]
 

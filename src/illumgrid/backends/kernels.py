@@ -282,10 +282,13 @@ def moments(worth, first, sky, lamplight, channel):
 
 
 @jit
-def solve_queries(scene, ids, point, normal, level, target, first, bounces, seed, throughput, worth, mean, m2, paths):
+def solve_queries(
+    scene, ids, point, normal, level, target, first, bounces, seed, throughput, worth, mean, m2, paths, stop
+):  # fmt: skip
     """Irradiance at queries in frame coordinates, from a path for each row of `worth`, from number `first` on.
 
     Fills mean (n, C), m2 (n, C) and paths (n,); `throughput` (C,) and `worth` (paths, C) are room to write into.
+    Another thread may set `stop` (1,): no further path begins, and the answer is worth nothing.
     """
     count = worth.shape[0]
     for i in range(ids.shape[0]):
@@ -297,6 +300,8 @@ def solve_queries(scene, ids, point, normal, level, target, first, bounces, seed
             continue
         key = stream(seed, ids[i])
         for k in range(count):
+            if stop[0] != 0:
+                return
             walk(scene, key, np.uint64(first + k), bounces, level[i], target[i], face, x, n, throughput, worth[k])
         for channel in range(worth.shape[1]):
             mean_worth, off = moments(worth, first, scene.background[channel], scene.lamplight[channel], channel)

@@ -17,12 +17,10 @@ from illumgrid.field.scene import Scene
 from illumgrid.grid.channels import Channels
 from illumgrid.stages import Backend, hookimpl
 from illumgrid.transport.samples import Queries, Samples, in_frame, in_turn
-from illumgrid.transport.tracer import laid_out, solve_once
+from illumgrid.transport.tracer import answered, laid_out, solve_once
 
 if TYPE_CHECKING:
     from illumgrid.backends.mesh.meshes import Meshes
-
-Rows = slice | NDArray[np.int64]
 
 
 def cores() -> int:
@@ -78,7 +76,7 @@ class NumbaTracer:
     channels: Channels
     fields: Marchable
     meshes: "Meshes | None"
-    threads: ThreadPoolExecutor | None
+    threads: ThreadPoolExecutor
 
     def __reduce__(self) -> tuple[Any, ...]:
         return self.backend.prepare, (self.scene,)
@@ -95,8 +93,9 @@ class NumbaTracer:
         from illumgrid.backends.kernels import solve_queries
 
         channels, (point, normal, level) = len(self.channels), in_frame(self.scene, queries)
+        stop = np.zeros(1, np.uint8)
 
-        def chunk(surfaces: Any, rows: Rows) -> None:
+        def chunk(surfaces: Any, rows: NDArray[np.int64]) -> None:
             if "stack" in surfaces._fields:  # each piece of work has a stack of its own
                 surfaces = surfaces._replace(stack=surfaces.stack.copy())
             light, spread = np.zeros((2, len(queries.id[rows]), channels), np.float32)
@@ -106,24 +105,22 @@ class NumbaTracer:
                 solve_queries(
                     surfaces, queries.id[rows], point[rows], normal[rows], level[rows], queries.target[rows],
                     paths.start, bounces, np.uint64(seed), np.empty(channels), np.empty((len(paths), channels)),
-                    light, spread, good,
+                    light, spread, good, stop,
                 )  # fmt: skip
             mean[rows], m2[rows], count[rows] = light, spread, good
 
-        # Ctrl-C waits for the chunks at work: at most a million paths each.
+        # Progress shows, and threads end together, if a chunk is at most a million paths.
         threads = self.backend.threads or cores()
         size = max(1, min(1024, max(16, n // (8 * threads) + 1), (1 << 20) // len(paths)))
-        pieces: Iterator[tuple[Any, Rows]] = (
+        pieces: Iterator[tuple[Any, NDArray[np.int64]]] = (
             (surfaces, members[i : i + size])
             for surfaces, members in self._surfaces(queries.level)
             for i in range(0, len(members), size)
         )
         first = next(pieces)
-        if compiled(solve_queries, first[0]):
-            pieces = chain([first], pieces)
-        else:
-            chunk(*first)  # in the caller's thread: Ctrl-C ends a compilation only there
-        share(self.threads, chunk, pieces)
+        if not compiled(solve_queries, first[0]):
+            chunk(first[0], first[1][:0])  # in the caller's thread: Ctrl-C ends a compilation only there
+        share(self.threads, chunk, chain([first], pieces), stop)
         return answer
 
     def _surfaces(self, level: NDArray[np.float64]) -> Iterator[tuple[Any, NDArray[np.int64]]]:
@@ -143,28 +140,39 @@ def compiled(kernel: Any, surfaces: Any) -> bool:
     return known is None or any(signature[0] == numba.typeof(surfaces) for signature in known)
 
 
-def pool(threads: int) -> ThreadPoolExecutor | None:
-    """So many threads, 0 for one per processor; None for a single one, whose work the caller does."""
-    return None if (threads or cores()) == 1 else ThreadPoolExecutor(threads or cores())
+def pool(threads: int) -> ThreadPoolExecutor:
+    """So many threads, 0 for one per processor. The caller's is not among them: it waits for Ctrl-C."""
+    return ThreadPoolExecutor(threads or cores())
 
 
-def share(threads: ThreadPoolExecutor | None, work: Callable[..., None], pieces: Iterator[tuple[Any, ...]]) -> None:
-    """Do the work on all pieces. They are made while others are at work, but not many before their turn."""
-    if threads is None:
-        for piece in pieces:
-            work(*piece)
-        return
-    waiting: set[Future[None]] = set()
+def share(
+    threads: ThreadPoolExecutor,
+    work: Callable[..., None],
+    pieces: Iterator[tuple[Any, NDArray[np.int64]]],
+    stop: NDArray[np.uint8],
+) -> None:
+    """Do the work on all pieces. They are made while others are at work, but not many before their turn.
+
+    On Ctrl-C pieces that wait are dropped, and `stop` (1,) tells those at work to end.
+    """
+    waiting: dict[Future[None], int] = {}
+    report = answered.get()
+
+    def until(most: int) -> None:
+        while len(waiting) > most:
+            for future in wait(waiting, return_when=FIRST_COMPLETED).done:
+                future.result()
+                report(waiting.pop(future))
+
     try:
         for piece in pieces:
-            waiting.add(threads.submit(work, *piece))
-            if len(waiting) >= 4 * cores():
-                done, waiting = wait(waiting, return_when=FIRST_COMPLETED)
-                for future in done:
-                    future.result()
-        for future in waiting:
-            future.result()
-    finally:  # on Ctrl-C the chunks that wait are dropped
+            waiting[threads.submit(work, *piece)] = len(piece[1])
+            until(4 * cores())
+        until(0)
+    except BaseException:
+        stop[0] = 1
+        raise
+    finally:
         for future in waiting:
             future.cancel()
         wait(waiting)

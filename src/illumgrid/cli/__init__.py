@@ -1,6 +1,7 @@
 """The command line: one file per command; only here does the package print."""
 
 import io
+import signal
 import sys
 from collections.abc import Callable
 from typing import Annotated, Any
@@ -13,10 +14,11 @@ from illumgrid.cli.info import info
 from illumgrid.cli.plugins import plugins
 from illumgrid.cli.preview import preview
 from illumgrid.cli.run import run
-from illumgrid.cli.terminal import say
+from illumgrid.cli.terminal import say, say_what_compiles
 from illumgrid.cli.verify import verify
 from illumgrid.cli.view import view
 from illumgrid.errors import BadInput
+from illumgrid.io import disk
 
 app = typer.Typer(
     help="Global illumination for every isosurface of a volume at once.",
@@ -47,11 +49,18 @@ def root(
 
 
 def main() -> None:
-    """Run the command line: exit 2 and one sentence on bad input, 130 on Ctrl-C."""
+    """Run the command line: exit 2 and one sentence on bad input, 130 on Ctrl-C, SIGTERM and SIGHUP."""
+    stops = [number for number in disk.STOPS if signal.getsignal(number) != signal.SIG_IGN]  # nohup ignores one
+    for number in stops:
+        signal.signal(number, signal.default_int_handler)
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # what the terminal or the pipe has no sign for is written as \\u00fc
             stream.reconfigure(errors="backslashreplace")
-    sys.exit(guarded(lambda: app(standalone_mode=False)))
+    say_what_compiles()
+    code = guarded(lambda: app(standalone_mode=False))
+    for number in stops:  # nothing is left but the end of the threads
+        signal.signal(number, signal.SIG_IGN)
+    sys.exit(code)
 
 
 def in_options(sentence: str) -> str:
@@ -63,13 +72,15 @@ def in_options(sentence: str) -> str:
 
 def guarded(command: Callable[[], Any]) -> int:
     """Exit code of a command."""
+    disk.written.clear()
     try:
         code = command()
         if code == 130:  # what typer makes of Ctrl-C
             raise KeyboardInterrupt
         return code if isinstance(code, int) else 0
     except (typer.Abort, KeyboardInterrupt):
-        say("illumgrid: stopped; nothing was written")
+        what = f"{disk.written[0]} is written and complete" if disk.written else "nothing was written"
+        say(f"illumgrid: stopped; {what}")
         return 130
     except BadInput as error:
         say(f"illumgrid: {in_options(str(error))}")

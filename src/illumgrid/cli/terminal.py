@@ -1,5 +1,6 @@
 """What every command writes to the terminal: single lines, warnings as they occur, progress with the time left."""
 
+import logging
 import time
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
@@ -44,6 +45,25 @@ def reported_warnings(ignored: Sequence[str] | None = None) -> Iterator[list[str
         warnings.simplefilter("always", IllumgridWarning)
         warnings.showwarning = show  # type: ignore[assignment]
         yield sentences
+
+
+def say_what_compiles() -> None:
+    """Say when compilation begins, and every `INTERVAL` seconds how far it is."""
+    begun: list[float] = []
+
+    def note(record: logging.LogRecord) -> bool:
+        now = time.monotonic()
+        if not begun:
+            say("compiling, once on this machine: this may take a minute")
+            begun.extend((now, now))
+        elif now - begun[1] >= INTERVAL:
+            begun[1] = now
+            say(f"compiling for {now - begun[0]:.0f} s: {record.getMessage()}")
+        return False
+
+    log = logging.getLogger("illumgrid.compiled")
+    log.setLevel(logging.INFO)
+    log.addFilter(note)
 
 
 @contextmanager

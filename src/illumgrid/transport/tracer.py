@@ -1,5 +1,7 @@
 """A backend set up for a scene: the setup runs once, and its data belong to the tracer."""
 
+from collections.abc import Callable
+from contextvars import ContextVar
 from dataclasses import dataclass
 from typing import Any, Protocol, cast
 
@@ -10,6 +12,9 @@ from illumgrid.field.scene import Scene
 from illumgrid.grid.channels import Channels, channels_of
 from illumgrid.transport.samples import Queries, Samples
 from illumgrid.transport.stages import Backend
+
+answered: ContextVar[Callable[[int], None]] = ContextVar("answered", default=lambda count: None)
+"""What a tracer calls while it solves, with the number of queries that have their answer since the last call."""
 
 
 class Tracer(Protocol):

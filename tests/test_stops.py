@@ -1,0 +1,100 @@
+"""Stops: within deep work, by every signal, at any moment; and progress within one batch."""
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from illumgrid import cli
+from illumgrid.backends.numba_ import Numba
+from illumgrid.bake import Bake, wall_queries
+from illumgrid.field.scene import Scene, level_table
+from illumgrid.io import disk
+from illumgrid.transport.tracer import prepare
+from shapes import ball
+from test_cli_process import COMMAND, start
+
+
+@pytest.fixture(scope="module")
+def box():
+    """A closed room of white walls, and queries on them."""
+    scene = Scene.box(ball(10), albedo=(0.8, 0.8, 0.8), range=(0.3, 0.9))
+    return scene, wall_queries(scene, level_table(scene, 2))[0]
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_ctrl_c_ends_a_chunk_and_does_not_wait_for_its_paths(box, threads, monkeypatch):
+    """The queries are a single chunk of 2^20 paths."""
+    scene, queries = box
+    tracer = prepare(Numba(threads=threads), scene)
+    tracer.solve(queries[:1], paths=range(1), bounces=1, seed=0)
+    from illumgrid.backends import kernels
+
+    stops, real = [], kernels.solve_queries
+
+    def solving(*arguments):
+        threading.Timer(0.05, os.kill, (os.getpid(), signal.SIGINT)).start()
+        real(*arguments)
+        stops.append((arguments[-1][0], arguments[-2].copy()))
+
+    solving.signatures = getattr(real, "signatures", None)
+    monkeypatch.setattr(kernels, "solve_queries", solving)
+    with pytest.raises(KeyboardInterrupt):
+        tracer.solve(queries[:16], paths=range(1 << 16), bounces=100_000, seed=0)
+    assert stops and all(stop == 1 and not paths.all() for stop, paths in stops)
+
+
+def test_a_batch_shows_progress_within_it(box):
+    scene, queries = box
+    shown = []
+    tracer = prepare(Numba(threads=1), scene)
+    bake = Bake.of([queries], 1, 0).walk(tracer, range(2), progress=lambda *about: shown.append(about))
+    done = [about[1] for about in shown]
+    assert done == sorted(done) and done[0] == 0 and done[-1] == len(bake.samples)
+    assert len(set(done)) > 8 and {about[2] for about in shown} == {len(queries)}
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no such signals")
+@pytest.mark.parametrize("stop", ["SIGTERM", "SIGHUP"])
+def test_other_signals_are_like_ctrl_c(tmp_path, stop):
+    np.save(tmp_path / "v.npy", ball(12).values)
+    args = ("run", "v.npy", "--range", "0.3", "0.9", "--paths", "50000", "-o", "out")
+    with start(*args, cwd=tmp_path, said=subprocess.PIPE) as process:
+        try:
+            while "voxels" not in process.stderr.readline():
+                assert process.poll() is None
+            time.sleep(0.5)
+            process.send_signal(getattr(signal, stop))
+            _, said = process.communicate(timeout=30)
+        finally:
+            process.kill()
+    assert process.returncode == 130 and said.splitlines()[-1] == "illumgrid: stopped; nothing was written"
+    assert "Traceback" not in said and [p.name for p in tmp_path.iterdir()] == ["v.npy"]
+
+
+def test_ctrl_c_during_the_imports_has_no_traceback(tmp_path):
+    (tmp_path / "typer.py").write_text("raise KeyboardInterrupt")
+    path = os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])
+    done = subprocess.run(
+        [*COMMAND, "--version"], capture_output=True, text=True, env={**os.environ, "PYTHONPATH": path}
+    )
+    assert (done.returncode, done.stderr) == (130, "illumgrid: stopped; nothing was written\n")
+
+
+def test_a_stop_after_the_rename_says_what_stands(tmp_path, capsys):
+    def stopped_late():
+        disk.write_file(tmp_path / "page.html", b"page")
+        raise KeyboardInterrupt
+
+    assert cli.guarded(stopped_late) == 130
+    assert capsys.readouterr().err == f"illumgrid: stopped; {tmp_path / 'page.html'} is written and complete\n"
+
+    def refused():
+        raise KeyboardInterrupt
+
+    assert cli.guarded(refused) == 130 and "nothing was written" in capsys.readouterr().err
