@@ -75,27 +75,13 @@ def hat(d):
     return t * t if t > 0.0 else 0.0
 
 
-@jit
-def estimate(start, place, light, variance, shape, u, level, normal, log, weights, near, system, right, found):
-    """Light at index u of the lit lattice, for a surface of this level and normal, from the samples around it.
-
-    Samples lie in bins, one for each node of the lattice, `start` (nodes + 1,) in order. place (m, 8): index
-    coordinates, level, normal, slope. The weights are those of a joint bilateral filter,
-
-        w = hat(dx) hat(dy) hat(dz) exp(-(δ/LEVEL)²/2) / |∇h'| exp(-(1 - n·n')/TURN),   δ = |c' - c| / |∇h'|,
-
-    the value is that of the linear function of position which fits best (moving least squares, a ridge on its slope),
-    held within the range of the samples. A steep sample is near to more levels: divided by its slope, the weight is the
-    same in sum over all levels, or steep places, which are brighter on rough fields, would be preferred. Fills found
-    (C,); returns variance and number of samples, 0 if none is near.
-
-    The variance is Σ a² σ² of the samples' noise, a their weights in the fit, and (1 + Σ a²) s², s² being by how much
-    more than noise the samples around scatter about the fit: the light at the point does so too.
-    """
+@inlined
+def weigh(start, place, shape, u, level, normal, exponents, weights, near):
+    """Find the samples around index u and their weights: fills `weights` and `near`, returns how many there are."""
     low0, high0 = max(int(np.ceil(u[0] - 2.5)), 0), min(int(np.floor(u[0] + 2.5)), shape[0] - 1)
     low1, high1 = max(int(np.ceil(u[1] - 2.5)), 0), min(int(np.floor(u[1] + 2.5)), shape[1] - 1)
     low2, high2 = max(int(np.ceil(u[2] - 2.5)), 0), min(int(np.floor(u[2] + 2.5)), shape[2] - 1)
-    count, top, channels = 0, -np.inf, light.shape[1]
+    count, top = 0, -np.inf
     for a in range(low0, high0 + 1):
         for b in range(low1, high1 + 1):
             row = (a * shape[1] + b) * shape[2]
@@ -115,57 +101,29 @@ def estimate(start, place, light, variance, shape, u, level, normal, log, weight
                 exponent = -0.5 * delta * delta - (1.0 - cosine) / TURN
                 if exponent < top - NEGLIGIBLE:
                     continue
-                log[count], weights[count], near[count] = exponent, hat(x) * hat(y) * hat(z) / slope, i
+                exponents[count], weights[count], near[count] = exponent, hat(x) * hat(y) * hat(z) / slope, i
                 top = max(top, exponent)
                 count += 1
-    if count == 0:
-        return np.inf, 0.0
-    total, squares, noise = 0.0, 0.0, 0.0
-    for r in range(4):
-        for s in range(4):
-            system[r, s] = 0.0
-        for k in range(channels):
-            right[r, k] = 0.0
     kept = 0
     for j in range(count):
-        if log[j] < top - NEGLIGIBLE:
-            continue
-        i, weight = near[j], weights[j] * np.exp(log[j] - top)
-        weights[kept], near[kept] = weight, i
-        kept += 1
-        x, y, z = place[i, 0] - u[0], place[i, 1] - u[1], place[i, 2] - u[2]
-        total += weight
-        squares += weight * weight
-        noise += weight * variance[i]
-        system[1, 0] += weight * x
-        system[2, 0] += weight * y
-        system[3, 0] += weight * z
-        system[1, 1] += weight * x * x
-        system[2, 1] += weight * x * y
-        system[3, 1] += weight * x * z
-        system[2, 2] += weight * y * y
-        system[3, 2] += weight * y * z
-        system[3, 3] += weight * z * z
-        for k in range(channels):
-            value = weight * light[i, k]
-            right[0, k] += value
-            right[1, k] += value * x
-            right[2, k] += value * y
-            right[3, k] += value * z
-    system[0, 0] = total
-    for r in range(1, 4):
-        system[r, r] += RIDGE * total
-    for j in range(4):  # Cholesky's factor, in place
+        if exponents[j] >= top - NEGLIGIBLE:
+            weights[kept], near[kept] = weights[j] * np.exp(exponents[j] - top), near[j]
+            kept += 1
+    return kept
+
+
+@inlined
+def solve(system, right, least):
+    """Solve a system of four positive definite equations for the columns of `right`, in place, by Cholesky's factor."""
+    for j in range(4):
         for k in range(j):
             system[j, j] -= system[j, k] * system[j, k]
-        system[j, j] = np.sqrt(max(system[j, j], 1e-12 * total))
+        system[j, j] = np.sqrt(max(system[j, j], least))
         for i in range(j + 1, 4):
             for k in range(j):
                 system[i, j] -= system[i, k] * system[j, k]
             system[i, j] /= system[j, j]
-    column = right.shape[1] - 1  # the last column asks for the weights themselves
-    right[0, column], right[1, column], right[2, column], right[3, column] = 1.0, 0.0, 0.0, 0.0
-    for k in range(column + 1):
+    for k in range(right.shape[1]):
         for i in range(4):
             for j in range(i):
                 right[i, k] -= system[i, j] * right[j, k]
@@ -174,21 +132,67 @@ def estimate(start, place, light, variance, shape, u, level, normal, log, weight
             for j in range(i + 1, 4):
                 right[i, k] -= system[j, i] * right[j, k]
             right[i, k] /= system[i, i]
-    scatter, own, spread = 0.0, 0.0, 0.0
-    for j in range(kept):
-        i = near[j]
+
+
+@inlined
+def fit(place, light, u, count, weights, near, system, right):
+    """Fit a linear function of position to the samples: its coefficients, and in the last column those of the weights.
+
+    Returns the sum of the weights.
+    """
+    system[:], right[:], total = 0.0, 0.0, 0.0
+    for j in range(count):
+        i, weight = near[j], weights[j]
+        at = (1.0, place[i, 0] - u[0], place[i, 1] - u[1], place[i, 2] - u[2])
+        total += weight
+        for r in range(4):
+            for s in range(r + 1):
+                system[r, s] += weight * at[r] * at[s]
+            for k in range(light.shape[1]):
+                right[r, k] += weight * at[r] * light[i, k]
+    for r in range(1, 4):
+        system[r, r] += RIDGE * total
+    right[0, light.shape[1]] = 1.0
+    solve(system, right, 1e-12 * total)
+    return total
+
+
+@jit
+def estimate(start, place, light, variance, shape, u, level, normal, exponents, weights, near, system, right, found):
+    """Light at index u of the lit lattice, for a surface of this level and normal, from the samples around it.
+
+    Samples lie in bins, one for each node of the lattice, `start` (nodes + 1,) in order. place (m, 8): index
+    coordinates, level, normal, slope. The weights are those of a joint bilateral filter,
+
+        w = hat(dx) hat(dy) hat(dz) exp(-(δ/LEVEL)²/2) / |∇h'| exp(-(1 - n·n')/TURN),   δ = |c' - c| / |∇h'|,
+
+    the value is that of the linear function of position which fits best (moving least squares, a ridge on its slope),
+    held within the range of the samples. A steep sample is near to more levels: divided by its slope, the weight is the
+    same in sum over all levels, or steep places, which are brighter on rough fields, would be preferred. Fills found
+    (C,); returns variance and number of samples, 0 if none is near.
+
+    The variance is Σ a² σ² of the samples' noise, a their weights in the fit, and (1 + Σ a²) s², s² being by how much
+    more than noise the samples around scatter about the fit: the light at the point does so too.
+    """
+    count, channels = weigh(start, place, shape, u, level, normal, exponents, weights, near), light.shape[1]
+    if count == 0:
+        return np.inf, 0.0
+    total = fit(place, light, u, count, weights, near, system, right)
+    scatter, own, spread, noise, squares = 0.0, 0.0, 0.0, 0.0, 0.0
+    for j in range(count):
+        i, weight = near[j], weights[j]
         x, y, z = place[i, 0] - u[0], place[i, 1] - u[1], place[i, 2] - u[2]
-        share = weights[j] * (right[0, column] + right[1, column] * x + right[2, column] * y + right[3, column] * z)
+        share = weight * (right[0, channels] + right[1, channels] * x + right[2, channels] * y + right[3, channels] * z)
         own += share * share * variance[i]
         spread += share * share
-        off = 0.0
+        noise += weight * variance[i]
+        squares += weight * weight
         for k in range(channels):
             miss = light[i, k] - right[0, k] - right[1, k] * x - right[2, k] * y - right[3, k] * z
-            off += miss * miss
-        scatter += weights[j] * off / channels
+            scatter += weight * miss * miss / channels
     for k in range(channels):
         lowest, highest = np.inf, -np.inf
-        for j in range(kept):
+        for j in range(count):
             lowest, highest = min(lowest, light[near[j], k]), max(highest, light[near[j], k])
         found[k] = min(max(right[0, k], lowest), highest)
     if not noise < np.inf:
@@ -207,7 +211,7 @@ def fill(
     A node whose value lies beyond the `ends` of the range reads at the nearest end, where the gradient leads to it. u
     is x times `ratio`; `dark` marks the nodes of the lit lattice that are holes.
     """
-    log, weights, near = np.empty(MOST), np.empty(MOST), np.empty(MOST, np.int64)
+    exponents, weights, near = np.empty(MOST), np.empty(MOST), np.empty(MOST, np.int64)
     system, right = np.empty((4, 4)), np.empty((4, light.shape[1] + 1))
     found = np.zeros(light.shape[1])
     for i in range(len(x)):
@@ -237,7 +241,7 @@ def fill(
             continue
         square, count = estimate(
             start, place, light, variance, shape, (a * ratio[0], b * ratio[1], c * ratio[2]),
-            (level - shift) * scale, (nx, ny, nz), log, weights, near, system, right, found,
+            (level - shift) * scale, (nx, ny, nz), exponents, weights, near, system, right, found,
         )  # fmt: skip
         if count > 0.0:
             error[i], support[i] = np.sqrt(square), count
