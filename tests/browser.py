@@ -2,6 +2,7 @@
 
 import base64
 import io
+import time
 from pathlib import Path
 
 import numpy as np
@@ -96,6 +97,15 @@ TO = """(address) => new Promise((done) => {
 })"""
 
 
+def until(page, condition):
+    """Wait for a condition; Playwright's own way evaluates text, which the page's policy forbids."""
+    end = time.monotonic() + 120
+    while not page.evaluate(condition):
+        assert time.monotonic() < end, condition
+        time.sleep(0.01)
+    return page
+
+
 class Browser:
     """One browser per test module; it records requests and errors."""
 
@@ -124,8 +134,7 @@ class Browser:
         return self.settle()
 
     def settle(self):
-        self.page.wait_for_function("document.querySelector('canvas').getAttribute('aria-busy') === 'false'")
-        return self.page
+        return until(self.page, "document.querySelector('canvas').getAttribute('aria-busy') === 'false'")
 
     def pixels(self):
         self.settle()

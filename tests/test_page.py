@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from browser import HEIGHT, WIDTH, bent, browser, coloured, decoded, pair, still  # noqa: F401
+from browser import HEIGHT, WIDTH, bent, browser, coloured, decoded, pair, still, until  # noqa: F401
 from illumgrid.show import BACKGROUND, fit_camera
 from illumgrid.show.engines import software
 from illumgrid.show.shade import Shown, opaque
@@ -189,7 +189,7 @@ def test_a_browser_without_webgl2_gets_a_sentence(browser):  # noqa: F811
     file = browser.folder / "none.html"
     file.write_text(built(SCENES["bent"]), encoding="utf-8")
     page.goto(file.as_uri())
-    page.wait_for_function("!document.querySelector('[data-part=message]').hidden")
+    until(page, "!document.querySelector('[data-part=message]').hidden")
     assert "WebGL2" in page.locator('[role="alert"]').inner_text()
     page.close()
 

@@ -1,9 +1,11 @@
 """``illumgrid view``: a file, a server, a window."""
 
+import os
 import re
 import signal
 import subprocess
 import sys
+import time
 import urllib.request
 
 import numpy as np
@@ -50,7 +52,7 @@ def test_view_serves_the_page_until_ctrl_c(folder):
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=hear
     ) as process:
         try:
-            address = re.search(r"http://127\.0\.0\.1:\d+/", process.stderr.readline())[0]
+            address = re.search(r"http://127\.0\.0\.1:\d+/\S+", process.stderr.readline())[0]
             with urllib.request.urlopen(address, timeout=20) as answer:
                 assert b"<canvas" in answer.read()
             process.send_signal(signal.SIGINT)
@@ -58,6 +60,24 @@ def test_view_serves_the_page_until_ctrl_c(folder):
         finally:
             process.kill()
     assert process.returncode == 0 and not said
+
+
+def test_a_browser_that_runs_until_it_is_closed_gets_its_page(folder, tmp_path):
+    browser, got = tmp_path / "browser.py", tmp_path / "got.html"
+    browser.write_text(
+        "import os, sys, urllib.request as u\n"
+        f"open('new', 'wb').write(u.urlopen(sys.argv[1], timeout=20).read())\nos.replace('new', {str(got)!r})"
+    )
+    environment = {**os.environ, "BROWSER": f"{sys.executable} {browser} %s"}
+    command = [*COMMAND, "view", str(folder)]
+    with subprocess.Popen(command, cwd=tmp_path, env=environment, stderr=subprocess.PIPE) as process:
+        try:
+            until = time.monotonic() + 20
+            while not got.exists() and process.poll() is None and time.monotonic() < until:
+                time.sleep(0.02)
+        finally:
+            process.kill()
+    assert b"<canvas" in got.read_bytes()
 
 
 WINDOW = """

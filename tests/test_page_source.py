@@ -1,8 +1,12 @@
 """The page without a browser: its source, its data, and its server."""
 
+import base64
 import gzip
+import hashlib
 import re
+import socket
 import threading
+import time
 import urllib.error
 import urllib.request
 from dataclasses import replace
@@ -18,7 +22,7 @@ from illumgrid.show.trust import relative
 from illumgrid.show.viewer import MODULES, SHADERS, compressed, packing, page, script, source
 from illumgrid.show.viewer.arrays import field_steps, reduced, thinned
 from illumgrid.show.viewer.packing import Stage, packed
-from illumgrid.show.viewer.server import serve
+from illumgrid.show.viewer.server import CONNECTIONS, serve
 from shapes import MIRRORED, ball, lit, sampled, sky
 
 LIGHT = coloured(pair())
@@ -213,10 +217,48 @@ def test_the_server_answers_this_machine_only_and_only_with_the_page():
         assert server.server_address[0] == "127.0.0.1" and server.server_address[1] > 0
         with urllib.request.urlopen(server.address, timeout=10) as answer:
             assert answer.read() == b"<p>here</p>" and answer.headers["Content-Type"].startswith("text/html")
-        for address, host, code in ((server.address, "evil.example", 403), (server.address + "etc", None, 404)):
+            policy = answer.headers["Content-Security-Policy"]
+            assert "frame-ancestors 'none'" in policy and "allow-popups" not in policy and "allow-forms" not in policy
+        port = server.address.rpartition(":")[2].partition("/")[0]
+        unknown = (server.address + "etc", f"http://127.0.0.1:{port}/", f"http://127.0.0.1:{port}/{'A' * 32}/")
+        for address, host, code in ((server.address, "evil.example", 403), *((other, None, 404) for other in unknown)):
             asked = urllib.request.Request(address, headers={"Host": host} if host else {})
             with pytest.raises(urllib.error.HTTPError) as refused:
                 urllib.request.urlopen(asked, timeout=10)
             assert refused.value.code == code
             refused.value.close()
         server.shutdown()
+
+
+def test_every_start_of_the_server_has_an_address_of_its_own():
+    with serve(b"") as one, serve(b"") as other:
+        assert one.place != other.place and min(len(one.place), len(other.place)) > 30
+
+
+def test_many_connections_at_once_are_hung_up_on_and_the_page_comes_again_later():
+    with serve(b"<p>here</p>") as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        idle = [socket.create_connection(server.server_address) for _ in range(CONNECTIONS)]
+        late = socket.create_connection(server.server_address)
+        late.settimeout(10)
+        assert late.recv(1) == b""  # hung up on
+        for one in (*idle, late):
+            one.close()
+        until = time.monotonic() + 10
+        while True:
+            try:
+                with urllib.request.urlopen(server.address, timeout=10) as answer:
+                    assert answer.read() == b"<p>here</p>"
+                break
+            except OSError:
+                assert time.monotonic() < until
+        server.shutdown()
+
+
+def test_the_page_may_run_its_own_script_and_no_text():
+    text = page(lit(sky()))
+    (policy,) = re.findall(r'http-equiv="Content-Security-Policy" content="([^"]*)"', text)
+    assert "unsafe-eval" not in policy and "default-src 'none'" in policy and "form-action 'none'" in policy
+    (run,) = re.findall(r'<script type="module">(.*?)</script>', text, re.DOTALL)
+    digest = base64.b64encode(hashlib.sha256(run.encode()).digest()).decode()
+    assert f"script-src 'sha256-{digest}';" in policy

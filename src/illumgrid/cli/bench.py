@@ -48,6 +48,6 @@ def bench(
             default = (given.preset.grid, given.preset.paths) if given.preset else (None, PATHS)
             found = race(scene, budget, seed, progress, default, studio)
         content, text = files(found, given.name, scene)
+    typer.echo(text)  # first: it stays where the files do not
     disk.write_folder(folder, iter(content.items()))
-    typer.echo(text)
     say(f"wrote {folder}; look at {folder / 'chart.png'}")

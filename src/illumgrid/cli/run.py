@@ -3,9 +3,12 @@
 import shlex
 import sys
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from shutil import rmtree
+from tempfile import gettempdir, mkdtemp
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -257,7 +260,7 @@ def run(
             )  # fmt: skip
         about = {"input": asked.name if source is None else source, "reading": reading, "smooth": smooth or 0.0}
         light = replace(light, recipe={**light.recipe, **about, "warnings": sentences})
-        light.save(folder, preview=not no_preview, overwrite=overwrite)
+        _save(light, folder, not no_preview, overwrite)
         light = _judged(light, stages, folder)
         about = {key: light.recipe[key] for key in ("reached", "reached_uncertain")}
         store.amend(folder, {**about, "warnings": sentences})
@@ -269,6 +272,24 @@ def _why_auto() -> str:
     from illumgrid import registry
 
     return f"backend: {registry.auto_backend()} ({registry.WHY_AUTO})"
+
+
+def _save(light: "Illumination", folder: Path, preview: bool, overwrite: bool) -> None:
+    """Save the light; where that fails, keep it elsewhere: hours of work are not lost to a full disk."""
+    try:
+        light.save(folder, preview=preview, overwrite=overwrite)
+    except Exception:
+        for place in (gettempdir(), "~"):
+            with suppress(Exception):
+                work = Path(mkdtemp(prefix="illumgrid-", dir=Path(place).expanduser()))
+                try:
+                    light.save(work / folder.name, preview=False)
+                except BaseException:
+                    rmtree(work, ignore_errors=True)
+                    raise
+                say(f"the light is kept in {work / folder.name}; move that folder to where you want it")
+                break
+        raise
 
 
 def _judged(light: "Illumination", stages: dict[str, Any], folder: Path) -> "Illumination":

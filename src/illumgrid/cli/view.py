@@ -50,8 +50,10 @@ def view(
     with serve(text) as server:
         say(f"serving {server.address} to this machine only; stop with Ctrl-C")
         if not no_open:
+            import threading
             import webbrowser
 
-            webbrowser.open(server.address)
+            # In a thread: a browser that runs until its window closes would wait for a page that nobody serves.
+            threading.Thread(target=webbrowser.open, args=(server.address,), daemon=True).start()
         with suppress(KeyboardInterrupt):  # the normal end of a server: exit 0
             server.serve_forever()

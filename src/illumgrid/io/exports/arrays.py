@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from illumgrid.errors import BadInput
 from illumgrid.field.volume import Floats, Lattice, index_to_world, interpolate, world_to_index
 from illumgrid.tone import curve, encode_srgb
 
@@ -150,6 +151,9 @@ def write_exr(path: Path, points: Points, progress: "Progress") -> None:
         if name != "color"  # an EXR viewer makes its own
     }
     OpenEXR.File(header, channels).write(str(path))
+    # The library flushes where it cannot report a full disk, and leaves out channels that it cannot read back: look.
+    if {*OpenEXR.File(str(path)).channels()} != {*channels}:
+        raise BadInput("what was written cannot be read back, the disk may be full")
     progress("file", 1, 1)
 
 

@@ -5,6 +5,7 @@ Its source lies in the folder ``page``: JavaScript modules, shaders, one style s
 
 import base64
 import gzip
+import hashlib
 import html
 import json
 import re
@@ -45,6 +46,13 @@ def _json(value: Any) -> str:
     return json.dumps(value, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
 
 
+def policy(text: str) -> str:
+    """What the page may do: run this one script, show pictures that it drew; no network, no frames, no forms."""
+    digest = base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
+    allowed = f"script-src 'sha256-{digest}'; style-src 'unsafe-inline'; img-src data: blob:"
+    return f"default-src 'none'; {allowed}; base-uri 'none'; form-action 'none'"
+
+
 def page(light: Illumination, up: str | None = None) -> str:
     """One HTML file that holds everything: it opens from disk and makes no network request.
 
@@ -71,4 +79,5 @@ def page(light: Illumination, up: str | None = None) -> str:
         "data": base64.b64encode(compressed(data)).decode(),
         "script": script("page"),
     }
+    parts["policy"] = policy(f"\n{parts['script']}\n")
     return re.sub(r"\{\{(\w+)\}\}", lambda found: parts[found[1]], source("page.html"))

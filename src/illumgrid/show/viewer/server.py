@@ -1,47 +1,85 @@
-"""Serve the page to this machine only."""
+"""Serve the page to this machine only, and there only to those who know the address."""
 
+import secrets
+import socket
 import sys
+import threading
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import Any
+
+CONNECTIONS = 32
+"""At once; more are hung up on, so that descriptors and threads do not run out."""
+
+CHUNK = 1 << 16
+"""Bytes that a slow reader has `_Answer.timeout` seconds for."""
+
+HEADERS = {
+    "Content-Type": "text/html; charset=utf-8",
+    "Cache-Control": "no-store",
+    # Beside the page's own policy: what only a header can say.
+    "Content-Security-Policy": "frame-ancestors 'none'; sandbox allow-scripts allow-same-origin allow-downloads",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Referrer-Policy": "no-referrer",
+    "X-Content-Type-Options": "nosniff",
+}
 
 
 class PageServer(ThreadingHTTPServer):
-    """One page at ``/`` of 127.0.0.1, on a free port."""
+    """One page at 127.0.0.1, on a free port, under a token that is drawn at each start."""
 
     daemon_threads = True
 
     def __init__(self, page: bytes) -> None:
         super().__init__(("127.0.0.1", 0), _Answer)
         self.page = page
+        self.place = f"/{secrets.token_urlsafe(24)}/"
+        self.free = threading.Semaphore(CONNECTIONS)
 
     @property
     def address(self) -> str:
         """Where a browser finds the page."""
-        return f"http://127.0.0.1:{self.server_address[1]}/"
+        return f"http://127.0.0.1:{self.server_address[1]}{self.place}"
 
-    def handle_error(self, request: object, client_address: object) -> None:
+    def process_request(self, request: Any, client_address: Any) -> None:
+        """Answer in a thread of its own, if not too many are at work."""
+        if self.free.acquire(blocking=False):
+            super().process_request(request, client_address)
+        else:
+            self.shutdown_request(request)
+
+    def process_request_thread(self, request: Any, client_address: Any) -> None:
+        """Answer."""
+        try:
+            super().process_request_thread(request, client_address)
+        finally:
+            self.free.release()
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
         """Ignore a browser that hangs up; report anything else as usual."""
-        if not isinstance(sys.exception(), ConnectionError):
-            super().handle_error(request, client_address)  # type: ignore[arg-type]
+        if not isinstance(sys.exception(), ConnectionError | TimeoutError):
+            super().handle_error(request, client_address)
 
 
 class _Answer(BaseHTTPRequestHandler):
     server: PageServer
+    timeout = 20.0
+    connection: socket.socket
 
     def do_GET(self) -> None:
-        """Answer with the page if it was requested by the name of this machine."""
+        """Answer with the page if it was requested by its token and by the name of this machine."""
         host = (self.headers.get("Host") or "").rpartition(":")[0]
         if host not in ("127.0.0.1", "localhost"):  # a foreign name that resolves to this machine (DNS rebinding)
             self.send_error(HTTPStatus.FORBIDDEN)
-        elif self.path.partition("?")[0] != "/":
+        elif not secrets.compare_digest(self.path.partition("?")[0].encode(), self.server.place.encode()):
             self.send_error(HTTPStatus.NOT_FOUND)
         else:
             self.send_response(HTTPStatus.OK)
-            self.send_header("Content-Type", "text/html; charset=utf-8")
-            self.send_header("Content-Length", str(len(self.server.page)))
-            self.send_header("Cache-Control", "no-store")
+            for name, value in (HEADERS | {"Content-Length": str(len(self.server.page))}).items():
+                self.send_header(name, value)
             self.end_headers()
-            self.wfile.write(self.server.page)
+            for at in range(0, len(self.server.page), CHUNK):
+                self.wfile.write(self.server.page[at : at + CHUNK])
 
     def log_message(self, format: str, *args: object) -> None:
         """Write nothing: the terminal belongs to the command."""
