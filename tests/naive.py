@@ -12,6 +12,8 @@ from itertools import pairwise, product
 
 import numpy as np
 
+from illumgrid.field.lights import Distant, Sky
+from illumgrid.field.upright import sky_axes
 from illumgrid.rng import draw, draw_pair, net_size, sharing, stream
 
 WALL = 1e-10
@@ -311,10 +313,10 @@ class Wall:
 
 
 def lamps(scene):
-    """(wall, probability) of every quad that emits: in proportion to power."""
+    """(wall, probability) of every quad that emits: in proportion to power, all together as much as one disc."""
     walls = [wall for k in range(len(scene.quads)) if (wall := Wall(scene, k)).power() > 0]
     total = sum(wall.power() for wall in walls)
-    return [(wall, wall.power() / total) for wall in walls]
+    return [(wall, wall.power() / total / (1 + len(distant(scene)))) for wall in walls]
 
 
 def lamp_density(scene, number, distance, d):
@@ -416,18 +418,74 @@ def path_worth(scene, query, path, bounces, seed):
         choices = [float(draw(key, np.uint64(path), np.uint64(k))) for k in range(bounces + 1)]
     hit, worth, throughput = on_query(scene, query), np.zeros(3), np.ones(3)
     for k in range(bounces + 1):
-        if lamps(scene):
+        if choices[k] < lamp_chance(scene):
             worth = worth + throughput * ask_a_lamp(scene, query.level[0], hit, *u[k], choices[k])
+        elif distant(scene):
+            worth = worth + throughput * ask_the_sky(scene, query.level[0], hit, *u[k], choices[k])
         d = cosine_direction(hit.normal, u[k][0], u[k][1])
         start, hit = hit, first_hit(scene, query.level[0], hit.x, d, on=hit)
         if hit is None:
-            return worth + throughput * scene.background
+            p = sum(a * b for a, b in zip(start.normal, d)) / math.pi
+            asked = radiance_of_discs(scene, d) * p / (p + sky_density(scene, d))
+            return worth + throughput * (scene.background + smooth_sky(scene, d) + asked)
         if hit.normal is None:
             return worth
         emission, albedo = surface(scene, hit, start, d)
         worth = worth + throughput * emission
         throughput = throughput * albedo
     return worth
+
+
+def distant(scene):
+    """Discs of the sky that shine."""
+    return [light for light in scene.lights if isinstance(light, Distant)]
+
+
+def lamp_chance(scene):
+    """Probability with which lamps are asked, among lamps and discs in equal parts."""
+    return bool(lamps(scene)) / (1 + len(distant(scene)))
+
+
+def within(scene, disc, d):
+    """Whether a frame direction lies in a disc."""
+    towards = scene.fields[0].volume.direction.T @ disc.direction
+    return float(np.dot(towards, d)) >= math.cos(math.radians(disc.angle))
+
+
+def sky_density(scene, d):
+    """Density per solid angle with which `ask_the_sky` asks for a frame direction."""
+    parts = bool(lamps(scene)) + len(distant(scene))
+    solid = [2 * math.pi * (1 - math.cos(math.radians(disc.angle))) for disc in distant(scene)]
+    return sum(1 / (parts * s) for disc, s in zip(distant(scene), solid) if within(scene, disc, d))
+
+
+def radiance_of_discs(scene, d):
+    """Radiance (3,) of all discs along a frame direction."""
+    shining = [disc.irradiance / (math.pi * math.sin(math.radians(disc.angle)) ** 2) for disc in distant(scene)]
+    return sum((L for disc, L in zip(distant(scene), shining) if within(scene, disc, d)), np.zeros(3))
+
+
+def smooth_sky(scene, d):
+    """Radiance (3,) of constant skies and gradients along a frame direction."""
+    up = scene.fields[0].volume.direction.T @ sky_axes(scene)[2]
+    height, total = float(np.dot(up, d)), np.zeros(3)
+    for sky in (light for light in scene.lights if isinstance(light, Sky)):
+        nadir, zenith = np.broadcast_to(sky.radiance, (2, 3))
+        total = total + nadir * (1 - height) / 2 + zenith * (1 + height) / 2
+    return total
+
+
+def ask_the_sky(scene, levels, hit, u1, u2, choice):
+    """Light (3,) from one direction within one disc, if nothing is in the way, weighted against the cosine."""
+    first, count = lamp_chance(scene), len(distant(scene))
+    disc = distant(scene)[min(count - 1, int((choice - first) * count / (1 - first)))]
+    cosine = 1 - u1 * (1 - math.cos(math.radians(disc.angle)))
+    # The frame is that of a cosine-distributed direction, whose own cosine is sqrt(1 - u).
+    d = cosine_direction(scene.fields[0].volume.direction.T @ disc.direction, 1 - cosine * cosine, u2)
+    p = sum(a * b for a, b in zip(hit.normal, d)) / math.pi
+    if p <= 0 or first_hit(scene, levels, hit.x, d, on=hit) is not None:
+        return np.zeros(3)
+    return radiance_of_discs(scene, d) * p / (p + sky_density(scene, d))
 
 
 def surface(scene, hit, start, d):
@@ -514,7 +572,12 @@ def lamplight(scene, channel):
         math.pi * quad.material.emission[channel] * np.linalg.norm(np.cross(quad.edge_u, quad.edge_v))
         for quad in scene.quads
     )
-    return float(flux / (2 * (a * b + b * c + c * a)))
+    discs = sum(
+        math.pi * disc.irradiance[channel] * (1 - math.cos(math.radians(disc.angle)))
+        / (2 * math.pi * math.sin(math.radians(disc.angle)) ** 2)
+        for disc in distant(scene)
+    )  # fmt: skip
+    return float(flux / (2 * (a * b + b * c + c * a)) + discs)
 
 
 def spread(worth, first, sky, lamps):

@@ -267,7 +267,7 @@ def test_rbf_lays_a_ridge_where_its_weights_would_amplify_and_nowhere_else():
         weight, value, step = np.zeros((1, n)), np.zeros((1, 3)), np.zeros(1, np.int64)
         spline.weigh(
             np.zeros((1, 3)), np.arange(n)[None], np.linalg.norm(x, axis=1)[None], x, np.ones((n, 3)),
-            spline.AMPLIFIES, weight, value, step,
+            3, spline.AMPLIFIES, weight, value, step,
         )  # fmt: skip
         assert weight.sum() == pytest.approx(1, abs=1e-6) and np.abs(weight).sum() <= spline.AMPLIFIES + 1e-6
         return step[0]

@@ -9,8 +9,9 @@ from PIL import Image
 import illumgrid as ig
 from illumgrid.errors import BadInput
 from illumgrid.field.scene import Scene
+from illumgrid.field.upright import axes_of, up_of
 from illumgrid.show import UPS, fit_camera, png, render, strip
-from illumgrid.show.camera import axes_of, camera_of, camera_text, up_of
+from illumgrid.show.camera import camera_of, camera_text
 from illumgrid.show.captions import round_down, scale_bar
 from illumgrid.show.engines import gl
 from illumgrid.tone import curve, decode_srgb, encode_srgb

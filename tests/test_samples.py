@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import illumgrid as ig
+from illumgrid.field.layers import ALL
 from illumgrid.field.scene import Field, Scene
 from illumgrid.field.volume import Volume, interpolate, world_to_index
 from illumgrid.grid.channels import GREY, RGB, Channels
@@ -236,6 +237,7 @@ def test_a_grey_scene_takes_one_channel_whose_rgb_is_what_three_would_be(stage, 
     grey = backend.solve(scene, asked, **request)
     assert grey.channels == GREY and grey.light.shape == grey.spread.shape == (20, 1) and grey.paths.any()
     monkeypatch.setattr(tracer, "channels_of", lambda scene: RGB)
+    monkeypatch.setattr(tracer, "columns_of", lambda scene: ALL)
     colored = backend.solve(scene, asked, **request)
     assert colored.channels == RGB and colored.light.shape == (20, 3)
     for name in ("mean", "m2", "stderr", "error"):

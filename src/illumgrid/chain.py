@@ -17,6 +17,7 @@ from illumgrid.bake import Map, Progress, bake, enough_bounces, light_left_out
 from illumgrid.constants import PATHS
 from illumgrid.errors import BadInput, tell
 from illumgrid.field.lattice import specs_over
+from illumgrid.field.layers import layers_of
 from illumgrid.field.scene import Scene, level_table
 from illumgrid.io import store
 from illumgrid.light import Illumination
@@ -28,7 +29,9 @@ from illumgrid.transport.tracer import prepare
 def load(folder: str | os.PathLike[str]) -> Illumination:
     """Read what `Illumination.save` or ``illumgrid run`` wrote."""
     stored = store.read(folder)
-    return Illumination(stored.scene, stored.levels, stored.grids, stored.walls, stored.recipe)
+    return Illumination(
+        stored.scene, stored.levels, stored.grids, stored.walls, stored.recipe, stored.recipe.get("weights", {})
+    )
 
 
 def _stage(kind: str, given: Any, options: dict[str, Any] | None = None) -> Any:
@@ -195,8 +198,7 @@ def judged(light: Illumination, backend: Backend) -> Illumination:
 
 
 def _shines(scene: Scene) -> bool:
-    materials = [field.material for field in scene.fields] + [quad.material for quad in scene.quads]
-    return bool(scene.background.any() or any(m.emission.any() for m in materials))
+    return any(any(layer.color) for layer in layers_of(scene))
 
 
 def rounds(plan: Plan, until: float, clock: Callable[[], float] = time.perf_counter) -> Iterator[range]:

@@ -1,8 +1,10 @@
 """The result of a run: light for every isosurface of a scene."""
 
+import difflib
+import math
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -10,9 +12,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from illumgrid import tone
+from illumgrid.errors import BadInput
+from illumgrid.field.layers import layers_of
 from illumgrid.field.levelset import Marchable, marchable
+from illumgrid.field.lights import Distant, Harmonics, Sky, projected, rotated
 from illumgrid.field.scene import Levels, Scene
+from illumgrid.field.upright import sky_axes
 from illumgrid.grid import IlluminationGrid, WallTexture
+from illumgrid.grid.channels import mixed
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,6 +38,8 @@ class Illumination:
         One a quad.
     recipe : mapping
         How it was computed: stages, paths, seconds, versions; all of it JSON.
+    weights : mapping
+        What `mix` multiplied lights by.
     """
 
     scene: Scene
@@ -38,6 +47,78 @@ class Illumination:
     grids: tuple[IlluminationGrid, ...]
     walls: tuple[WallTexture, ...]
     recipe: Mapping[str, Any]
+    weights: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def lights(self) -> tuple[str, ...]:
+        """Names of the lights that are kept apart, which `mix` takes."""
+        return tuple(layer.name for layer in layers_of(self.scene))
+
+    def mix(self, **weights: float) -> "Illumination":
+        """The same light with its lights multiplied by weights: no new computation, and no copy of what is stored.
+
+        Parameters
+        ----------
+        **weights : float
+            By the name of a light, relative to the scene; a light that is left out keeps its weight. Names that are no
+            Python words: ``light.mix(**{"my lamp": 0.5})``.
+
+        Returns
+        -------
+        Illumination
+            Exposed anew. Error bars of grids are an upper bound: the sum of |weight| times the error of each light.
+
+        Raises
+        ------
+        BadInput
+            On an unknown name, or a weight that is not finite.
+        """
+        for name, weight in weights.items():
+            if name not in self.lights:
+                close = difflib.get_close_matches(name, self.lights, 1)
+                hint = f"; did you mean {close[0]!r}?" if close else ""
+                known = ", ".join(self.lights) or "none: the scene is dark"
+                raise BadInput(f"no light is named {name!r}; expected one of {known}{hint}")
+            if not np.isfinite(weight):
+                raise BadInput(f"the weight of light {name!r} is {weight}; expected a finite number")
+        return self._shown_as(self.scene, {**self.weights, **weights})
+
+    def under(self, sky: Sky | Distant | None, turn: float = 0.0) -> "Illumination":
+        """The same light under another sky: for a scene that keeps spherical harmonics, see `Scene.in_harmonics`.
+
+        Parameters
+        ----------
+        sky : Sky, Distant or None
+            As smooth as the harmonics can show it; None is the light of the scene.
+        turn : float
+            Degrees about up: by 90, what is in the back of the sky comes to the right.
+
+        Raises
+        ------
+        BadInput
+            If the scene keeps no harmonics.
+        """
+        found = [light for light in self.scene.lights if isinstance(light, Harmonics)]
+        if not found:
+            raise BadInput(
+                "this light was not computed for spherical harmonics; expected a run with --lights sh, or "
+                "scene.in_harmonics(): run it again"
+            )
+        degree = math.isqrt(len(found[0].coefficients)) - 1
+        new = rotated(projected(found[0] if sky is None else sky, degree, sky_axes(self.scene)), turn)
+        lights = tuple(replace(o, coefficients=new) if o is found[0] else o for o in self.scene.lights)
+        return self._shown_as(replace(self.scene, lights=lights), self.weights)
+
+    def _shown_as(self, scene: Scene, weights: Mapping[str, float]) -> "Illumination":
+        layers = layers_of(scene)
+        whole = scene is self.scene and all(weight == 1.0 for weight in weights.values()) and not self.weights
+        if whole:
+            return self
+        grids = tuple(grid.showing(mixed(grid.channels, layers, weights)) for grid in self.grids)
+        walls = tuple(
+            replace(wall, values=wall.light, channels=mixed(wall.channels, layers, weights)) for wall in self.walls
+        )
+        return replace(self, scene=scene, grids=grids, walls=walls, weights=weights)
 
     def grid(self, field: str) -> IlluminationGrid:
         """Illumination grid of the field with this name."""
@@ -48,7 +129,8 @@ class Illumination:
         """Automatic exposure: one for all isovalues, views and fields, from the light that the grids hold."""
         lit = [grid.lit for grid in self.grids]
         albedo = [np.broadcast_to(f.material.albedo, e.shape) for f, e in zip(self.scene.fields, lit)]
-        return tone.automatic_exposure(np.concatenate(lit), np.concatenate(albedo))
+        highlights = tone.DIRECTED if any(isinstance(one, Distant) for one in self.scene.lights) else tone.EVEN
+        return tone.automatic_exposure(np.concatenate(lit), np.concatenate(albedo), highlights)
 
     @cached_property
     def marchable(self) -> Marchable:
@@ -118,5 +200,5 @@ class Illumination:
 
         store.claim(folder, overwrite)
         picture = png(render(self)) if preview else None
-        recipe = {**self.recipe, "exposure": self.exposure}
+        recipe = {**self.recipe, "exposure": self.exposure, "weights": dict(self.weights)}
         store.write(folder, store.Stored(self.scene, self.levels, self.grids, self.walls, recipe), picture, overwrite)

@@ -9,8 +9,18 @@ import numpy as np
 from numba.extending import register_jitable
 
 from illumgrid import constants
-from illumgrid.backends import lanes, march, surfaces
+from illumgrid.backends import lanes, lights, march, surfaces
 from illumgrid.backends.lanes import cached
+from illumgrid.backends.lights import (
+    cosine_direction,
+    distant_density,
+    distant_direction,
+    gather,
+    gather_asked,
+    gather_smooth,
+    lamp_density,
+    lamp_point,
+)
 from illumgrid.backends.march import dot
 from illumgrid.backends.mesh import bvh
 from illumgrid.backends.mesh import cast as mesh_cast
@@ -21,7 +31,7 @@ from illumgrid.rng import draw, draw_pair, mix, net_size, pascal, reverse, shari
 for _function in (mix, stream, draw, reverse, pascal, upward, draw_pair, net_size, sharing):
     register_jitable(_function)
 
-_SOURCES = lanes, march, surfaces, bvh, mesh_cast, constants
+_SOURCES = lanes, lights, march, surfaces, bvh, mesh_cast, constants
 jit = cached(*_SOURCES, _nrt=False)  # as in `march`
 inlined = cached(*_SOURCES, _nrt=False, forceinline=True)
 
@@ -88,24 +98,6 @@ def hit_normal(scene, number, what, face, x, d):
 
 
 @jit
-def cosine_direction(u1, u2, nx, ny, nz):
-    """Direction with density cosine / π about the normal n, from two uniform numbers.
-
-    Malley's method; the frame by Duff et al., "Building an orthonormal basis, revisited", JCGT 6(1), 2017.
-    """
-    radius, angle = np.sqrt(u1), 2.0 * np.pi * u2
-    x, y, z = radius * np.cos(angle), radius * np.sin(angle), np.sqrt(1.0 - u1)
-    sign = 1.0 if nz >= -1e-6 else -1.0  # 0 is common on voxel data and comes out as -1e-17 in a turned frame
-    a = -1.0 / (sign + nz)
-    b = nx * ny * a
-    return (
-        x * (1.0 + sign * nx * nx * a) + y * b + z * nx,
-        x * sign * b + y * (sign + ny * ny * a) + z * ny,
-        -x * sign * nx - y * ny + z * nz,
-    )
-
-
-@jit
 def buried(scene, level, x, n, own):
     """Whether the frame point x, on a surface of normal n, lies inside the solid of a field other than `own`."""
     for f in range(scene.start.shape[0]):  # noqa: SIM110
@@ -115,53 +107,30 @@ def buried(scene, level, x, n, own):
 
 
 @jit
-def lamp_point(scene, choice, u, v):
-    """A point on a lamp, uniform by area: (quad, position), the lamp chosen in proportion to its power."""
-    lamp = 0
-    while lamp < scene.lamps.shape[0] - 1 and choice >= scene.lamp_share[lamp]:
-        lamp += 1
-    q = scene.lamps[lamp]
-    corner, along, across = scene.quad_corner[q], scene.quad_edges[q, 0], scene.quad_edges[q, 1]
-    return q, (
-        corner[0] + u * along[0] + v * across[0],
-        corner[1] + u * along[1] + v * across[1],
-        corner[2] + u * along[2] + v * across[2],
-    )
+def light_asked(scene, choice, u, v, level, on, on_face, x, n):
+    """Ask one light for what arrives at x: (weight, quad, direction); the quad is -1 for distant light.
 
-
-@jit
-def lamp_density(scene, q, distance, d):
-    """Density per solid angle with which `lamp_point` finds a point of quad q's front at this distance along d."""
-    facing = -dot(scene.quad_normal[q], d)
-    return scene.lamp_density[q] * distance * distance / facing if facing > 0.0 else 0.0
-
-
-@jit
-def light_from_lamps(scene, choice, u, v, level, on, on_face, x, n):
-    """Share of a lamp's emission that arrives at x from one point of one lamp, and the lamp: (weight, quad).
-
-    The weight is that of the balance heuristic: cosine density over the sum of both densities (Veach & Guibas 1995).
+    The weight, of a lamp's emission or of the radiance from that direction, is that of the balance heuristic: cosine
+    density over the sum of both densities (Veach & Guibas 1995).
     """
-    q, target = lamp_point(scene, choice, u, v)
-    wx, wy, wz = target[0] - x[0], target[1] - x[1], target[2] - x[2]
-    distance = np.sqrt(wx * wx + wy * wy + wz * wz)
-    if distance == 0.0:
-        return 0.0, q
-    d = (wx / distance, wy / distance, wz / distance)
-    by_cosine, by_lamp = dot(n, d) / np.pi, lamp_density(scene, q, distance, d)
-    number = scene.start.shape[0] + q
-    if by_cosine <= 0.0 or by_lamp <= 0.0 or number == on:
-        return 0.0, q
-    # The ray that meets this lamp first has met nothing else before.
+    q, number = -1, -1
+    if choice < scene.asked[0]:
+        q, target = lamp_point(scene, choice, u, v)
+        wx, wy, wz = target[0] - x[0], target[1] - x[1], target[2] - x[2]
+        distance = np.sqrt(wx * wx + wy * wy + wz * wz)
+        if distance == 0.0:
+            return 0.0, q, n
+        d = (wx / distance, wy / distance, wz / distance)
+        number, by_light = scene.start.shape[0] + q, lamp_density(scene, q, distance, d)
+    else:
+        d = distant_direction(scene, choice, u, v)
+        by_light = distant_density(scene, d)
+    by_cosine = dot(n, d) / np.pi
+    if by_cosine <= 0.0 or by_light <= 0.0 or (q >= 0 and number == on):
+        return 0.0, q, d
+    # The ray that meets this lamp first, or nothing, has met nothing else before.
     _, met, _, _ = nearest_hit(scene, level, x, n, d, on, on_face)
-    return (by_cosine / (by_cosine + by_lamp) if met == number else 0.0), q
-
-
-@inlined
-def gather(worth, throughput, weight, light):
-    """Add to what a path is worth the share of some light (C,) that comes back along it."""
-    for channel in range(worth.shape[0]):
-        worth[channel] += throughput[channel] * weight * light[channel]
+    return (by_cosine / (by_cosine + by_light) if met == number else 0.0), q, d
 
 
 @jit
@@ -174,13 +143,16 @@ def walk(scene, key, path, bounces, level, own, own_face, x, n, throughput, wort
     throughput[:], worth[:] = 1.0, 0.0
     on, on_face, fields = own, own_face, scene.start.shape[0]
     for segment in range(bounces + 1):
-        # Ask a lamp for its light, weighted against the chance that the ray below finds it. One pair of numbers serves
-        # both: each keeps its mean, and their shared boxes keep the error bars short.
+        # Ask a lamp or the sky for light, weighted against the chance that the ray below finds it. One pair of numbers
+        # serves both: each keeps its mean, and their shared boxes keep the error bars short.
         u1, u2 = draw_pair(key, path, np.uint64(segment))
-        if scene.lamps.shape[0] > 0:
+        if scene.lamps.shape[0] > 0 or scene.asked[0] < 1.0:
             choice = draw(key, path, np.uint64(segment))
-            weight, q = light_from_lamps(scene, choice, u1, u2, level, on, on_face, x, n)
-            gather(worth, throughput, weight, scene.emission[fields + q])
+            weight, q, d = light_asked(scene, choice, u1, u2, level, on, on_face, x, n)
+            if q >= 0:
+                gather(worth, throughput, weight, scene.emission[fields + q])
+            elif weight > 0.0:
+                gather_asked(scene, worth, throughput, weight, d)
 
         # Choose a direction by the cosine about the normal.
         d = cosine_direction(u1, u2, n[0], n[1], n[2])
@@ -188,9 +160,14 @@ def walk(scene, key, path, bounces, level, own, own_face, x, n, throughput, wort
         # Follow the ray to the nearest surface; one that dips under its own has hit it already.
         t, number, what, face = nearest_hit(scene, level, x, n, d, on, on_face)
 
-        # A path that escapes sees the background, and ends.
+        # A path that escapes sees the sky, and ends.
         if what == MISS:
             gather(worth, throughput, 1.0, scene.background)
+            if scene.harmonics.shape[0] > 0:
+                gather_smooth(scene, worth, throughput, d)
+            if scene.asked[0] < 1.0:
+                by_cosine, by_light = dot(n, d) / np.pi, distant_density(scene, d)
+                gather_asked(scene, worth, throughput, by_cosine / (by_cosine + by_light), d)
             break
 
         # A path inside a solid carries no light.
@@ -304,7 +281,7 @@ def solve_queries(
                 return
             walk(scene, key, np.uint64(first + k), bounces, level[i], target[i], face, x, n, throughput, worth[k])
         for channel in range(worth.shape[1]):
-            mean_worth, off = moments(worth, first, scene.background[channel], scene.lamplight[channel], channel)
+            mean_worth, off = moments(worth, first, scene.usual[channel], scene.lamplight[channel], channel)
             mean[i, channel], m2[i, channel] = np.pi * mean_worth, np.pi**2 * off
         paths[i] = count
 

@@ -4,6 +4,7 @@ The path loop has the headings of `kernels.walk`; everything that Numba's kernel
 meet is handed in: the trilinear level set here, its mesh in `embree`.
 """
 
+import math
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import ClassVar, Literal, Protocol
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 
 from illumgrid.constants import BURIED, CAP, LOST, MISS, NOWHERE, ON_A_VOXEL, ON_A_WALL, QUAD, SURFACE, UNSEEN
 from illumgrid.field.levelset import Marchable
+from illumgrid.field.lights import basis
 from illumgrid.field.scene import Scene
 from illumgrid.field.volume import Floats
 from illumgrid.grid.channels import Channels
@@ -272,15 +274,20 @@ class Marching:
 
 
 def cosine_direction(u1: Floats, u2: Floats, normal: Floats) -> Floats:
-    """Directions (n, 3) of density cosine / π about the normals; the frame by Duff et al., JCGT 6(1), 2017."""
+    """Directions (n, 3) of density cosine / π about the normals."""
     radius, angle = np.sqrt(u1), 2 * np.pi * u2
+    return about(radius * np.cos(angle), radius * np.sin(angle), np.sqrt(1 - u1), normal)
+
+
+def about(x: Floats, y: Floats, z: Floats, normal: Floats) -> Floats:
+    """Directions (n, 3) with these coordinates about normals; the frame by Duff et al., JCGT 6(1), 2017."""
     nx, ny, nz = normal.T
     sign = np.where(nz >= -1e-6, 1.0, -1.0)
     a = -1 / (sign + nz)
     b = nx * ny * a
     tangent = np.stack([1 + sign * nx * nx * a, sign * b, -sign * nx], axis=1)
     bitangent = np.stack([b, sign + ny * ny * a, -ny], axis=1)
-    local = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.sqrt(1 - u1)])[:, :, None]
+    local = np.stack([x, y, z])[:, :, None]
     return np.asarray(local[0] * tangent + local[1] * bitangent + local[2] * normal)
 
 
@@ -291,28 +298,99 @@ def lamp_density(scene: Marchable, q: Ints, distance: Floats, d: Floats) -> Floa
         return np.where(facing > 0, scene.lamp_density[q] * distance * distance / facing, 0.0)
 
 
-def light_from_lamps(
-    surfaces: Surfaces, u: Floats, level: Floats, on: Ints, on_face: Ints, x: Floats, normal: Floats
-) -> tuple[Floats, Ints]:
-    """Share (n,) of a lamp's emission that arrives at x from one point of one lamp, and the number (n,) of the quad.
+def image_place(scene: Marchable, d: Floats) -> tuple[Floats, Floats]:
+    """Rows and columns (n,), fractions of pixels from their edges, at which the image holds directions (n, 3)."""
+    x, y, z = scene.sky_axes @ d.T
+    rows, columns = scene.image_density.shape
+    return rows * np.arccos(np.clip(z, -1, 1)) / np.pi, columns * (np.arctan2(x, y) / (2 * np.pi) + 0.5)
 
-    The lamp is chosen in proportion to its power, the point uniform by area, from the numbers u (n, 3). The weight is
+
+def distant_direction(scene: Marchable, u: Floats) -> Floats:
+    """Directions (n, 3) in which to ask for distant light, from the numbers u (n, 3)."""
+    disc = np.minimum(np.searchsorted(scene.asked[2:], u[:, 2], side="right"), len(scene.disc_cosine) - 1)
+    result = np.zeros((len(u), 3))
+    pictured = u[:, 2] < scene.asked[1]
+    if not pictured.all():
+        z, angle = 1 - u[:, 0] * (1 - scene.disc_cosine[disc]), 2 * np.pi * u[:, 1]
+        radius = np.sqrt(np.maximum(0, 1 - z * z))
+        result[:] = about(radius * np.cos(angle), radius * np.sin(angle), z, scene.disc_axis[disc])
+    if pictured.any():
+        rows, columns = scene.image_density.shape
+        first, second = u[pictured, 0], u[pictured, 1]
+        edges = np.concatenate([[0.0], scene.image_rows])
+        i = np.searchsorted(scene.image_rows, first, side="right")
+        inner = np.column_stack([np.zeros(rows), scene.image_columns])[i]
+        j = (inner[:, 1:] <= second[:, None]).sum(axis=1)
+        down = (first - edges[i]) / (edges[i + 1] - edges[i])
+        low, high = (np.take_along_axis(inner, k[:, None], 1)[:, 0] for k in (j, j + 1))
+        top, bottom = np.cos(np.pi * i / rows), np.cos(np.pi * (i + 1) / rows)
+        z = top + down * (bottom - top)
+        azimuth = 2 * np.pi * ((j + (second - low) / (high - low)) / columns - 0.5)
+        level = np.sqrt(np.maximum(0, 1 - z * z))
+        result[pictured] = np.stack([level * np.sin(azimuth), level * np.cos(azimuth), z], axis=1) @ scene.sky_axes
+    return result
+
+
+def distant_density(scene: Marchable, d: Floats) -> Floats:
+    """Density per solid angle (n,) with which `distant_direction` finds directions (n, 3)."""
+    density = ((d @ scene.disc_axis.T >= scene.disc_cosine) * scene.disc_density).sum(axis=1)
+    if len(scene.image):
+        v, u = image_place(scene, d)
+        rows, columns = scene.image_density.shape
+        i, j = np.minimum(v.astype(int), rows - 1), np.minimum(u.astype(int), columns - 1)
+        density = density + scene.image_density[i, j]
+    return np.asarray(density)
+
+
+def asked_radiance(scene: Marchable, d: Floats) -> Floats:
+    """Radiance (n, C) of the image, bilinear, and of the discs along directions (n, 3)."""
+    light = (d @ scene.disc_axis.T >= scene.disc_cosine) @ scene.disc_radiance
+    if len(scene.image):
+        v, u = image_place(scene, d)
+        rows, columns = scene.image_density.shape
+        v, u = np.clip(v - 0.5, 0, rows - 1), u - 0.5
+        i, left = np.minimum(v.astype(int), rows - 2), np.floor(u).astype(int)
+        down, across = (v - i)[:, None], (u - left)[:, None]
+        ends = left % columns, (left + 1) % columns
+        upper, lower = (
+            (1 - across) * scene.image[i + k, ends[0]] + across * scene.image[i + k, ends[1]] for k in (0, 1)
+        )
+        light = light + (1 - down) * upper + down * lower
+    return np.asarray(light)
+
+
+def light_asked(
+    surfaces: Surfaces, u: Floats, level: Floats, on: Ints, on_face: Ints, x: Floats, normal: Floats
+) -> tuple[Floats, Floats]:
+    """Ask one light each for what arrives at x: weight (n,), and emission or radiance (n, C) that it goes with.
+
+    A lamp is chosen in proportion to its power, the point uniform by area, from the numbers u (n, 3). The weight is
     that of the balance heuristic: cosine density over the sum of both densities (Veach & Guibas 1995).
     """
-    scene = surfaces.scene
-    lamp = np.minimum(np.searchsorted(scene.lamp_share, u[:, 2], side="right"), len(scene.lamps) - 1)
-    q = scene.lamps[lamp]
-    target = scene.quad_corner[q] + np.einsum("ni,nij->nj", u[:, :2], scene.quad_edges[q])
-    distance = np.linalg.norm(target - x, axis=1)
-    d = (target - x) / np.where(distance > 0, distance, 1.0)[:, None]
-    by_cosine, by_lamp = np.einsum("ij,ij->i", normal, d) / np.pi, lamp_density(scene, q, distance, d)
-    number = len(scene.start) + q
-    ask = np.flatnonzero((distance > 0) & (by_cosine > 0) & (by_lamp > 0) & (number != on))
-    # The ray that meets this lamp first has met nothing else before.
+    scene, count = surfaces.scene, len(x)
+    d, by_light, number = np.zeros((count, 3)), np.zeros(count), np.full(count, -1)
+    light = np.zeros((count, len(scene.background)))
+    some = np.flatnonzero(u[:, 2] < scene.asked[0])
+    if len(some):
+        lamp = np.minimum(np.searchsorted(scene.lamp_share, u[some, 2], side="right"), len(scene.lamps) - 1)
+        q = scene.lamps[lamp]
+        target = scene.quad_corner[q] + np.einsum("ni,nij->nj", u[some, :2], scene.quad_edges[q])
+        distance = np.linalg.norm(target - x[some], axis=1)
+        d[some] = (target - x[some]) / np.where(distance > 0, distance, 1.0)[:, None]
+        by_light[some], number[some] = lamp_density(scene, q, distance, d[some]), len(scene.start) + q
+        by_light[some[distance == 0]] = 0.0
+        light[some] = scene.emission[number[some]]
+    some = np.flatnonzero(u[:, 2] >= scene.asked[0])
+    if len(some):
+        d[some] = distant_direction(scene, u[some])
+        by_light[some], light[some] = distant_density(scene, d[some]), asked_radiance(scene, d[some])
+    by_cosine = np.einsum("ij,ij->i", normal, d) / np.pi
+    ask = np.flatnonzero((by_cosine > 0) & (by_light > 0) & ((number != on) | (number < 0)))
+    # The ray that meets this lamp first, or nothing, has met nothing else before.
     _, met, _, _ = nearest_hit(surfaces, level[ask], x[ask], normal[ask], d[ask], on[ask], on_face[ask])
-    weight = np.zeros(len(x))
-    weight[ask] = np.where(met == number[ask], by_cosine[ask] / (by_cosine[ask] + by_lamp[ask]), 0.0)
-    return weight, number
+    weight = np.zeros(count)
+    weight[ask] = np.where(met == number[ask], by_cosine[ask] / (by_cosine[ask] + by_light[ask]), 0.0)
+    return weight, light
 
 
 def walk(
@@ -335,14 +413,14 @@ def walk(
     x, normal, on, on_face = x.copy(), normal.copy(), own.astype(np.int64), own_face.copy()
     alive, fields = np.arange(len(x)), len(scene.start)
     for segment in range(bounces + 1):
-        # Ask a lamp for its light, weighted against the chance that the ray below finds it. One pair of numbers serves
-        # both: each keeps its mean, and their shared boxes keep the error bars short.
+        # Ask a lamp or the sky for light, weighted against the chance that the ray below finds it. One pair of numbers
+        # serves both: each keeps its mean, and their shared boxes keep the error bars short.
         u1, u2 = draw_pair(key[alive], path[alive], np.uint64(segment))
-        if len(scene.lamps):
+        if len(scene.lamps) or scene.asked[0] < 1:
             u = np.stack([u1, u2, draw(key[alive], path[alive], np.uint64(segment))], axis=1)
             at = (level[alive], on[alive], on_face[alive], x[alive], normal[alive])
-            weight, number = light_from_lamps(surfaces, u, *at)
-            worth[alive] += keep[alive] * weight[:, None] * scene.emission[number]
+            weight, light = light_asked(surfaces, u, *at)
+            worth[alive] += keep[alive] * weight[:, None] * light
 
         # Choose a direction by the cosine about the normal.
         d = cosine_direction(u1, u2, normal[alive])
@@ -351,9 +429,16 @@ def walk(
         start = level[alive], x[alive], normal[alive]
         t, number, what, face = nearest_hit(surfaces, *start, d, on[alive], on_face[alive])
 
-        # A path that escapes sees the background, and ends.
-        escaped = alive[what == MISS]
+        # A path that escapes sees the sky, and ends.
+        escaped, away = alive[what == MISS], d[what == MISS]
         worth[escaped] += keep[escaped] * scene.background
+        if len(scene.harmonics):
+            degree = math.isqrt(len(scene.harmonics)) - 1
+            worth[escaped] += keep[escaped] * (basis(degree, away @ scene.sky_axes.T) @ scene.harmonics)
+        if scene.asked[0] < 1:
+            by_cosine, by_light = np.einsum("ij,ij->i", normal[escaped], away) / np.pi, distant_density(scene, away)
+            weight = by_cosine / (by_cosine + by_light)
+            worth[escaped] += keep[escaped] * weight[:, None] * asked_radiance(scene, away)
 
         # A path inside a solid carries no light.
         goes_on = (what != MISS) & (what != BURIED)
@@ -452,7 +537,7 @@ def answer(
             )
         light = light.reshape(len(rows), len(paths), -1).swapaxes(0, 1)
         mean[rows] = np.pi * light.mean(axis=0)
-        m2[rows] = np.pi**2 * spread(light, paths.start, surfaces.scene.background, surfaces.scene.lamplight)
+        m2[rows] = np.pi**2 * spread(light, paths.start, surfaces.scene.usual, surfaces.scene.lamplight)
     return mean, m2, good
 
 

@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from illumgrid.cli.lights import SkyImage, Turn, Weights, relit
 from illumgrid.cli.terminal import progress_bars, reported_warnings, say
 from illumgrid.errors import BadInput
 
@@ -27,6 +28,9 @@ def export(
             metavar="grid|field", help="Sample at the nodes of the grid or at the voxels of the field. [default: grid]"
         ),
     ] = None,
+    weights: Weights = None,
+    sky: SkyImage = None,
+    turn: Turn = 0.0,
     array: Annotated[
         str | None,
         typer.Option(
@@ -44,7 +48,7 @@ def export(
     if file.exists() and own.exists() and file.samefile(own):
         raise BadInput(f"{file} is the run itself; expected another name for the copy")
     with reported_warnings():
-        light = load(folder)
+        light = relit(load(folder), weights, sky, turn)
         with progress_bars() as progress:
             written = exports.write(light, file, field, isovalue, on=on, array=array, progress=progress)
     say(f"wrote {file}: {written}")

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from illumgrid.cli.lights import SkyImage, Turn, Weights, relit
 from illumgrid.cli.terminal import progress_bars, say
 from illumgrid.errors import BadInput, shown, shown_range
 
@@ -97,6 +98,9 @@ def preview(
         str | None,
         typer.Option(metavar="COLOR", help="CSS colour: white, #202030, transparent. [default: a dark grey]"),
     ] = None,
+    weights: Weights = None,
+    sky: SkyImage = None,
+    turn: Turn = 0.0,
     engine: Annotated[str, typer.Option(help="Rendering engine: auto, egl, osmesa, software.")] = "auto",
 ) -> None:
     """Draw an isosurface of a finished run, several side by side, or a sweep through the range."""
@@ -113,7 +117,7 @@ def preview(
     _check(given, output, sweep, isovalue, cut, background)
     several = None if isovalues is None else _numbers(isovalues)
     engine_used, why = show.choose_engine(engine)
-    light = load(folder)
+    light = relit(load(folder), weights, sky, turn)
     options: dict[str, Any] = {"background": background, "engine": engine_used, "stops": exposure}
     if size != SIZE:
         options |= {"width": size[0], "height": size[1]}

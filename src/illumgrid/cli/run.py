@@ -24,6 +24,10 @@ if TYPE_CHECKING:
     from illumgrid.light import Illumination
 
 
+AROUND = ("studio", "floor", "sky", "box")
+"""Scenes around a volume, by the names of their constructors; the first is the default."""
+
+
 @dataclass(frozen=True)
 class Input:
     """What is to be lit: a name for the folder of the result, and how the scene is made, blurred by `smooth` voxels."""
@@ -60,14 +64,14 @@ def _input(
         return Input(name, partial(_smoothed, preset.make), preset) if preset else _scene_file(name)
     if inside not in (None, "above", "below"):
         raise BadInput(f"--inside is {inside!r}; expected above or below")
-    if surroundings not in (None, "sky", "floor", "box"):
-        raise BadInput(f"--scene is {surroundings!r}; expected sky, floor or box")
+    if surroundings not in (None, *AROUND):
+        raise BadInput(f"--scene is {surroundings!r}; expected {', '.join(AROUND[:-1])} or {AROUND[-1]}")
     if signed and (also := given(inside=inside, label=reading.get("label"))):
         raise BadInput(
             f"--signed and --{next(iter(also))} came together; expected one of them: --signed lights h >= c and h <= -c"
         )
     side: Side | None = None if signed else "below" if inside == "below" else "above"
-    make = partial(_volume_scene, name, surroundings or "sky", albedo, limits, side, reading)
+    make = partial(_volume_scene, name, surroundings or AROUND[0], albedo, limits, side, reading)
     return Input(volume_name(name), make)
 
 
@@ -91,7 +95,7 @@ def _volume_scene(
     from illumgrid.field.volume import smooth as blur
     from illumgrid.io.readers import read_volume, volume_name
 
-    around = {"sky": Scene.sky, "floor": Scene.floor, "box": Scene.box}[surroundings]
+    around: Callable[..., Scene] = getattr(Scene, surroundings)
     name, labels = volume_name(source), labels_of(reading.get("label"))
     if labels:
         each = {label: blur(read_volume(source, **{**reading, "label": label}), smooth) for label in labels}
@@ -101,7 +105,7 @@ def _volume_scene(
         material = None if albedo is None else Material(np.asarray(albedo))
         return _around_all(around, signed_pair(name, blur(without_gaps(volume), smooth), limits, material))
     volume = finite(volume, inside)
-    return around(blur(volume, smooth), albedo or (0.8, 0.8, 0.8), limits, inside, name)
+    return around(blur(volume, smooth), albedo, limits, inside, name)
 
 
 def _around_all(around: Callable[..., "Scene"], fields: "Sequence[Field]") -> "Scene":
@@ -109,6 +113,14 @@ def _around_all(around: Callable[..., "Scene"], fields: "Sequence[Field]") -> "S
     first = fields[0]
     scene = around(first.volume, first.material.albedo, first.range, first.inside, first.name)
     return replace(scene, fields=tuple(fields))
+
+
+def _in_harmonics(scene: "Scene", lights: str | None, degree: int | None) -> "Scene":
+    if lights not in (None, "sh"):
+        raise BadInput(f"--lights is {lights!r}; expected sh, or leave it out to keep each light of the scene")
+    if lights is None and degree is not None:
+        raise BadInput("--degree came without --lights sh; expected both")
+    return scene if lights is None else scene.in_harmonics(2 if degree is None else degree)
 
 
 def _smoothed(make: Callable[[], "Scene"], smooth: float) -> "Scene":
@@ -190,11 +202,18 @@ def run(
     ] = None,
     surroundings: Annotated[
         str | None,
-        typer.Option("--scene", help="What is around a volume: sky, floor (and sky), box (and lamp). [default: sky]"),
+        typer.Option("--scene", help="What is around a volume: studio, floor, sky, box (and lamp). [default: studio]"),
     ] = None,
     albedo: Annotated[
         tuple[float, float, float] | None,
-        typer.Option(metavar="R G B", help="Share of light that the surface reflects. [default: 0.8 0.8 0.8]"),
+        typer.Option(metavar="R G B", help="Share of light that the surface reflects. [default: a neutral grey]"),
+    ] = None,
+    lights: Annotated[
+        str | None,
+        typer.Option(help="sh: keep the answer to spherical harmonics of distant light, for preview --sky and --turn."),
+    ] = None,
+    degree: Annotated[
+        int | None, typer.Option(min=0, max=4, metavar="L", help="Of those harmonics: (L + 1)² layers. [default: 2]")
     ] = None,
     spacing: Spacing = None,
     channel: Channel = None,
@@ -243,7 +262,7 @@ def run(
             isovalues = isovalues or asked.preset.isovalues
         folder = output or Path(f"{asked.name}-light")
         store.claim(folder, overwrite)
-        scene = asked.make(smooth or 0.0)
+        scene = _in_harmonics(asked.make(smooth or 0.0), lights, degree)
         for field in scene.fields:
             shape = " x ".join(map(str, field.volume.shape))
             say(f"{field.name}: {shape} voxels, isovalues {shown_range(field.range)}")

@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+from illumgrid.cli.lights import SkyImage, Turn, Weights, relit
 from illumgrid.cli.terminal import say
 from illumgrid.errors import BadInput
 
@@ -19,6 +20,9 @@ def view(
     desktop: Annotated[
         bool, typer.Option("--desktop", help="A PyVista window instead of a page; extracts each isosurface anew.")
     ] = False,
+    weights: Weights = None,
+    sky: SkyImage = None,
+    turn: Turn = 0.0,
     up: Annotated[
         str | None,
         typer.Option(metavar="AXIS", help="World axis that points up: x, y, z, -x, -y, -z. [default: z, see docs]"),
@@ -32,7 +36,7 @@ def view(
         raise BadInput(f"--export is {export.name!r}; expected a file name that ends in .html")
     if desktop and (export is not None or no_open or up is not None):
         raise BadInput("--desktop came with --export, --no-open or --up; expected it alone")
-    light = load(folder)
+    light = relit(load(folder), weights, sky, turn)
     if desktop:
         from illumgrid.show.viewer.desktop import show
 

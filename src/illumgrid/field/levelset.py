@@ -1,5 +1,6 @@
 """Level sets, as meshes and as bricks for marching."""
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -7,6 +8,7 @@ from numpy.typing import NDArray
 
 from illumgrid.errors import BadInput
 from illumgrid.field.bricks import lay_bricks
+from illumgrid.field.layers import ALL, Channel, light_tables
 from illumgrid.field.scene import Scene
 from illumgrid.field.volume import UPWARD, Floats, Side, Volume, index_to_world
 
@@ -103,7 +105,7 @@ class Marchable(NamedTuple):
     brick_shape: NDArray[np.int64]  # (F, 3)
     albedo: Floats  # (F + Q, 3): fields, then quads
     emission: Floats  # (F + Q, 3)
-    background: Floats  # (3,)
+    background: Floats  # (3,) constant radiance from all directions outside
     quad_corner: Floats  # (Q, 3) in the frame, as all that follows
     quad_edges: Floats  # (Q, 2, 3)
     quad_duals: Floats  # (Q, 2, 3): dot with a point from the corner gives its shares (0 to 1) along the edges
@@ -112,7 +114,20 @@ class Marchable(NamedTuple):
     lamps: NDArray[np.int64]  # (L,) numbers of the quads that emit
     lamp_share: Floats  # (L,) cumulative probability of choosing a lamp, proportional to its power
     lamp_density: Floats  # (Q,) probability density per area of choosing a point of the quad; 0 if it does not emit
-    lamplight: Floats  # (3,) radiance of all lamps if their power were spread over a box around the scene
+    lamplight: Floats  # (3,) radiance of all lamps spread over a box around the scene, of all discs over the sky
+    # What other distant light is, in C channels; directions in the frame, or along the axes of the sky.
+    sky_axes: Floats  # (3, 3) rows right, back, up in the frame
+    usual: Floats  # (C,) radiance of the sky in the mean, discs left out
+    harmonics: Floats  # (B, C) coefficients of the smooth skies; B is 0, or that of a whole degree
+    disc_axis: Floats  # (D, 3) frame directions to the middles
+    disc_cosine: Floats  # (D,) of half the angle
+    disc_radiance: Floats  # (D, C)
+    disc_density: Floats  # (D,) density per solid angle with which its directions are asked for
+    image: Floats  # (H, W, C) sum of the images; (0, 0, C) if there is none
+    image_rows: Floats  # (H,) cumulative probability of a row
+    image_columns: Floats  # (H, W) cumulative probability of a pixel in its row
+    image_density: Floats  # (H, W) density per solid angle, as for discs
+    asked: Floats  # (2 + D,) cumulative probability of asking lamps, the image, each disc
 
 
 def turned(volume: Volume, inside: Side) -> NDArray[np.float32]:
@@ -120,13 +135,17 @@ def turned(volume: Volume, inside: Side) -> NDArray[np.float32]:
     return volume.values if UPWARD[inside] > 0 else -volume.values
 
 
-def marchable(scene: Scene) -> Marchable:
-    """Lay out a scene for marching. This takes time, so keep the result. A single field is not copied."""
+def marchable(scene: Scene, channels: Sequence[Channel] = ALL) -> Marchable:
+    """Lay out a scene for marching. This takes time, so keep the result. A single field is not copied.
+
+    Albedos and lights have a column for each of `channels`, by default red, green and blue of all light together.
+    """
     parts = [turned(f.volume, f.inside) for f in scene.fields]
     values = [p.reshape(-1) for p in parts]
     bricks = [lay_bricks(p) for p in parts]
     records = [b.records.reshape(-1) for b in bricks]
     materials = [f.material for f in scene.fields] + [q.material for q in scene.quads]
+    colors, tables = [channel.color for channel in channels], light_tables(scene, channels)
     together = values[0].view() if len(parts) == 1 else np.concatenate(values)
     together.setflags(write=False)  # like a single volume: otherwise Numba compiles all kernels for a second type
     return Marchable(
@@ -139,14 +158,13 @@ def marchable(scene: Scene) -> Marchable:
         bricks=records[0] if len(parts) == 1 else np.concatenate(records),
         brick_start=np.cumsum([0, *(len(b.records) for b in bricks)], dtype=np.int64)[:-1],
         brick_shape=np.array([b.shape for b in bricks], dtype=np.int64),
-        albedo=np.array([material.albedo for material in materials]),
-        emission=np.array([material.emission for material in materials]),
-        background=np.array(scene.background),
-        **_quads_in_frame(scene),
+        albedo=np.ascontiguousarray(np.array([material.albedo for material in materials])[:, colors]),
+        **_quads_in_frame(scene, tables),
+        **tables,
     )
 
 
-def _quads_in_frame(scene: Scene) -> dict[str, NDArray[Any]]:
+def _quads_in_frame(scene: Scene, lights: dict[str, Floats]) -> dict[str, NDArray[Any]]:
     """The quad and lamp arrays of a `Marchable`."""
     axes, count = scene.fields[0].volume.direction, len(scene.quads)
     corner = scene.to_frame(np.array([q.corner for q in scene.quads]).reshape(count, 3))
@@ -157,12 +175,14 @@ def _quads_in_frame(scene: Scene) -> dict[str, NDArray[Any]]:
     area = np.array([q.area for q in scene.quads])
     power = np.array([q.material.emission.mean() * q.area for q in scene.quads]).reshape(count)
     lamps = np.flatnonzero(power > 0)
-    chance = power / power.sum() if len(lamps) else power
+    chance = power / power.sum() * lights["asked"][0] if len(lamps) else power
     boxes = [index_to_world(f.volume, [np.zeros(3), np.array(f.volume.shape) - 1.0]) for f in scene.fields]
     ends = [scene.to_frame(np.concatenate(boxes))]
     ends += [corner + one + other for one in (0, edges[:, 0]) for other in (0, edges[:, 1])]
     a, b, c = np.ptp(np.concatenate(ends), axis=0)
-    flux = sum((q.material.emission * q.area for q in scene.quads), np.zeros(3))
+    emission = lights["emission"][len(scene.fields) :]
+    flux = sum((color * q.area for color, q in zip(emission, scene.quads)), np.zeros(emission.shape[1]))
+    discs = 0.5 * (1 - lights["disc_cosine"]) @ lights["disc_radiance"]
     return {
         "quad_corner": corner,
         "quad_edges": edges,
@@ -172,7 +192,7 @@ def _quads_in_frame(scene: Scene) -> dict[str, NDArray[Any]]:
         "lamps": lamps,
         "lamp_share": np.cumsum(chance[lamps]),
         "lamp_density": chance / area if count else power,
-        "lamplight": flux / (2 * (a * b + b * c + c * a)),
+        "lamplight": flux / (2 * (a * b + b * c + c * a)) + discs,
     }
 
 

@@ -7,6 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from illumgrid.errors import BadInput, shown_range
 from illumgrid.field.boundaries import suggest_range
+from illumgrid.field.lights import Light
 from illumgrid.field.volume import UPWARD, Floats, Side, Volume, finite, index_to_world
 
 
@@ -133,6 +134,8 @@ class Quad:
     material : Material
     texels : (2,) tuple of int
         Resolution of its light texture along edge_u and edge_v.
+    light : str, optional
+        Name of its light if it emits: lights of one name are one layer. By default that of the quad.
     """
 
     name: str
@@ -141,6 +144,7 @@ class Quad:
     edge_v: Floats
     material: Material = field(default_factory=Material)
     texels: tuple[int, int] = (16, 16)
+    light: str | None = None
 
     def __post_init__(self) -> None:
         if not (isinstance(self.name, str) and self.name and self.name.isprintable()):
@@ -195,7 +199,9 @@ class Scene:
     quads : sequence of Quad
         Walls, floors, luminaires; their names are unique, also among those of the fields.
     background : (3,) array_like
-        Constant radiance from all directions outside, linear RGB.
+        Constant radiance from all directions outside, linear RGB: the light named ``sky``.
+    lights : sequence of Sky, Distant or Harmonics
+        Distant lights, each by its name: see `illumgrid.field.lights`.
 
     Notes
     -----
@@ -205,6 +211,7 @@ class Scene:
     fields: tuple[Field, ...]
     quads: tuple[Quad, ...] = ()
     background: Floats = field(default_factory=lambda: np.zeros(3))
+    lights: tuple[Light, ...] = ()
 
     def __post_init__(self) -> None:
         fields, quads = tuple(self.fields), tuple(self.quads)
@@ -223,25 +230,59 @@ class Scene:
         object.__setattr__(self, "fields", fields)
         object.__setattr__(self, "quads", quads)
         object.__setattr__(self, "background", _rgb(self.background, "background", np.inf))
+        object.__setattr__(self, "lights", tuple(self.lights))
+
+    @property
+    def open(self) -> bool:
+        """Whether light comes from outside; a room without such light is closed."""
+        return bool(self.background.any() or self.lights)
 
     @classmethod
     def sky(
         cls,
         volume: Volume,
-        albedo: ArrayLike = (0.8, 0.8, 0.8),
+        albedo: ArrayLike | None = None,
         range: ArrayLike | None = None,
         inside: Side = "above",
         name: str = "field",
     ) -> "Scene":
         """One field under a white sky of radiance 1."""
-        solid = Field(name, volume, Material(np.asarray(albedo)), range, inside)  # type: ignore[arg-type]
+        material = Material() if albedo is None else Material(np.asarray(albedo))
+        solid = Field(name, volume, material, range, inside)  # type: ignore[arg-type]
         return cls((solid,), background=np.ones(3))
+
+    @classmethod
+    def studio(
+        cls,
+        volume: Volume,
+        albedo: ArrayLike | None = None,
+        range: ArrayLike | None = None,
+        inside: Side = "above",
+        name: str = "field",
+    ) -> "Scene":
+        """One field in the light of a studio: a soft ``key`` from the upper left front, and a dim ``dome``.
+
+        The default albedo is a neutral grey, `illumgrid.field.presets.ALBEDO`.
+        """
+        from illumgrid.field.presets import ALBEDO, studio
+
+        material = Material(np.asarray(ALBEDO if albedo is None else albedo))
+        return studio(Field(name, volume, material, range, inside))  # type: ignore[arg-type]
+
+    def in_harmonics(self, degree: int = 2) -> "Scene":
+        """The same scene, its distant lights replaced by spherical harmonics of this degree, 0 to 4.
+
+        `Illumination.under` then shows it under any smooth sky.
+        """
+        from illumgrid.field.layers import in_harmonics
+
+        return in_harmonics(self, degree)
 
     @classmethod
     def floor(
         cls,
         volume: Volume,
-        albedo: ArrayLike = (0.8, 0.8, 0.8),
+        albedo: ArrayLike | None = None,
         range: ArrayLike | None = None,
         inside: Side = "above",
         name: str = "field",
@@ -257,7 +298,7 @@ class Scene:
     def box(
         cls,
         volume: Volume,
-        albedo: ArrayLike = (0.8, 0.8, 0.8),
+        albedo: ArrayLike | None = None,
         range: ArrayLike | None = None,
         inside: Side = "above",
         name: str = "field",

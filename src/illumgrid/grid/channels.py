@@ -1,12 +1,16 @@
 """Channels of light: light is linear, so grids and samples carry as many as a scene needs, and mix them to RGB."""
 
+import re
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from illumgrid.errors import BadInput
+from illumgrid.field.layers import Channel, Layer, colors_of, is_grey, layers_of
 from illumgrid.field.scene import Scene
 
 
@@ -28,24 +32,88 @@ class Channels:
     def __len__(self) -> int:
         return len(self.names)
 
+    @cached_property
+    def own(self) -> int:
+        """How many of the first channels are what is shown, as they are: 1 if that is grey, 3 for RGB, 0 if none."""
+        for few in (GREY_MIX, RGB_MIX):
+            if self.mix[: len(few)] == few and not any(map(any, self.mix[len(few) :])):
+                return len(few)
+        return 0
+
+    @property
+    def mixable(self) -> bool:
+        """Whether there are lights to weigh against each other, each with its own error.
+
+        Basis functions are too many, and no weighted sum of their errors would say much.
+        """
+        return len(self) > max(self.own, 1) and not any(re.search(r"\.\d+\.[YRGB]$", name) for name in self.names)
+
+    @property
+    def grey(self) -> bool:
+        """Whether what is shown has no colour."""
+        return self.own == 1
+
+    def shown(self, light: NDArray[np.float32]) -> NDArray[np.float32]:
+        """What is shown of light (..., C): grey (..., 1) or linear RGB (..., 3); a view where it is stored so."""
+        if self.own:
+            return light if self.own == len(self) else light[..., : self.own]
+        # Layers may be negative, and some weights too: only their sum is light.
+        return np.maximum(light @ np.array(self.mix, dtype=np.float32), np.float32(0))
+
     def rgb(self, light: NDArray[np.float32]) -> NDArray[np.float32]:
         """Linear RGB (..., 3) of light (..., C): a view where no arithmetic is needed."""
-        if self == RGB:
-            return light
-        if self == GREY:
-            return np.broadcast_to(light, (*light.shape[:-1], 3))
-        return light @ np.array(self.mix, dtype=np.float32)
+        shown = self.shown(light)
+        return np.broadcast_to(shown, (*light.shape[:-1], 3)) if self.grey else shown
 
 
-RGB = Channels(("R", "G", "B"), ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)))
-GREY = Channels(("Y",), ((1.0, 1.0, 1.0),))
+GREY_MIX = ((1.0, 1.0, 1.0),)
+RGB_MIX = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+RGB = Channels(("R", "G", "B"), RGB_MIX)
+GREY = Channels(("Y",), GREY_MIX)
+
+
+def columns_of(scene: Scene) -> list[Channel]:
+    """What the channels of a scene see: all light together, then each of several layers."""
+    grey = all(map(is_grey, colors_of(scene)))
+    layers = layers_of(scene)
+    together = [Channel(None, color) for color in range(1 if grey else 3)]
+    return together + [Channel(one, c) for one in layers for c in range(1 if one.grey else 3) if len(layers) > 1]
 
 
 def channels_of(scene: Scene) -> Channels:
-    """GREY where no material or light of a scene has a colour, else RGB."""
-    materials = [f.material for f in scene.fields] + [q.material for q in scene.quads]
-    colors = [scene.background, *(m.albedo for m in materials), *(m.emission for m in materials)]
-    return GREY if all((color == color[0]).all() for color in colors) else RGB
+    """The light of the scene as it is, GREY where nothing has a colour, else RGB; then each of several layers.
+
+    What is shown is the light of the scene as it is; the layers wait for another mix: see `mixed`.
+    """
+    columns = columns_of(scene)
+    together = [column for column in columns if column.layer is None]
+    names = GREY.names if len(together) == 1 else RGB.names
+    mix = GREY_MIX if len(together) == 1 else RGB_MIX
+    layered = columns[len(together) :]
+    return Channels((*names, *(c.name for c in layered)), (*mix, *((0.0, 0.0, 0.0) for _ in layered)))
+
+
+def mixed(channels: Channels, layers: Sequence[Layer], weights: Mapping[str, float]) -> Channels:
+    """The same channels, showing these layers multiplied by weights, 1 where none is given.
+
+    Parameters
+    ----------
+    channels : Channels
+        As `channels_of` made them.
+    layers : sequence of Layer
+        Those of the scene; of a sky in spherical harmonics with the coefficients of another sky, perhaps.
+    weights : mapping
+        From the name of a layer to a number.
+    """
+    known, rows = {layer.name: layer for layer in layers}, []
+    for name in channels.names:
+        layer, _, color = name.rpartition(".")
+        only = np.array(GREY_MIX[0] if color == "Y" else RGB_MIX["RGB".index(color)])
+        if layer:
+            rows.append(weights.get(layer, 1.0) * np.array(known[layer].color) * only)
+        else:  # all light together is part of a mix only where it is one layer
+            rows.append(only * (weights.get(layers[0].name, 1.0) if len(layers) == 1 else 0.0))
+    return Channels(channels.names, tuple((float(r), float(g), float(b)) for r, g, b in rows))
 
 
 def channels_for(count: int) -> Channels:

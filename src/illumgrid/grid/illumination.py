@@ -1,7 +1,7 @@
 """The illumination grid: light at the nodes of a lattice, with its error bar and its support."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from illumgrid.errors import BadInput
 from illumgrid.field.lattice import GridSpec
 from illumgrid.field.volume import Floats, corners, world_to_index
-from illumgrid.grid.channels import GREY, Channels, stored
+from illumgrid.grid.channels import Channels, stored
 from illumgrid.grid.lookup import read_lattice
 
 _BLOCK = 1 << 18  # nodes
@@ -42,6 +42,8 @@ class IlluminationGrid:
         Number of samples that the node rests upon; 0 marks a hole.
     channels : Channels, optional
         By default grey for one channel, RGB for three.
+    errors : (nx, ny, nz, C) float32, optional
+        Standard error of each channel, for the error of another mix of several layers.
 
     Attributes
     ----------
@@ -54,6 +56,7 @@ class IlluminationGrid:
     error: NDArray[np.float32]
     support: NDArray[np.float32]
     channels: Channels = None  # type: ignore[assignment]
+    errors: NDArray[np.float32] | None = None
     light: NDArray[np.float32] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -67,6 +70,17 @@ class IlluminationGrid:
                 raise BadInput(f"the {name} of a grid has shape {array.shape}; expected {shape}")
         for name, value in (arrays | stored(self.values, self.channels)).items():
             object.__setattr__(self, name, value)
+        if self.errors is not None and self.errors.shape != self.light.shape:
+            raise BadInput(f"the errors of a grid have shape {self.errors.shape}; expected {self.light.shape}")
+
+    def showing(self, channels: Channels) -> "IlluminationGrid":
+        """The same grid showing another mix of its layers; its error is an upper bound: Σ |weight| σ."""
+        error = np.full(self.error.shape, np.inf, np.float32)
+        if self.errors is not None:
+            known = np.isfinite(self.errors)  # infinite times 0 is no number
+            bound = np.where(known, self.errors, np.float32(0)) @ np.abs(np.array(channels.mix, np.float32))
+            error = np.where(known.all(axis=-1), np.sqrt(np.square(bound).mean(axis=-1)), np.inf)
+        return replace(self, values=self.light, channels=channels, error=error)
 
     def lookup(self, points: ArrayLike) -> NDArray[np.float32]:
         """Irradiance (n, 3) at world points (n, 3), trilinear between nodes; beyond the border, that of the border.
@@ -113,7 +127,8 @@ class IlluminationGrid:
         nearest = tuple(np.clip(np.round(world_to_index(self.spec, points)), 0, last).astype(np.int64).T)
         light = read_lattice(self.spec, self.light, points).reshape(*spec.shape, -1)
         error, support = (array[nearest].reshape(spec.shape) for array in (self.error, self.support))
-        return IlluminationGrid(spec, light, error, support, self.channels)
+        errors = None if self.errors is None else self.errors[nearest].reshape(light.shape)
+        return IlluminationGrid(spec, light, error, support, self.channels, errors)
 
     @property
     def lit(self) -> NDArray[np.float32]:
@@ -140,8 +155,7 @@ class IlluminationGrid:
 
     def _bend(self, axis: int, step: int) -> Floats:
         """Mean square over RGB of second differences along an axis, `step` nodes apart, less the noise in them."""
-        shown = self.light if self.channels == GREY else self.values
-        light, error = (np.moveaxis(a, axis, 0) for a in (shown, self.error))
+        light, error = (np.moveaxis(a, axis, 0) for a in (self.channels.shown(self.light), self.error))
         after, here, before = slice(2 * step, None), slice(step, -step), slice(None, -2 * step)
         square = np.square(light[after] - 2 * light[here] + light[before], dtype=float).mean(axis=-1)
         # Infinite at holes. Noise that neighbours share, as they rest on the same samples, cancels in the differences.

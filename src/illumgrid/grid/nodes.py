@@ -74,14 +74,23 @@ class Nodes:
             yield NodeBlock(self, some)
 
     def grid(
-        self, light: ArrayLike, error: ArrayLike, support: ArrayLike, channels: Channels | None = None
+        self,
+        light: ArrayLike,
+        error: ArrayLike,
+        support: ArrayLike,
+        channels: Channels | None = None,
+        errors: NDArray[np.float32] | None = None,
     ) -> IlluminationGrid:
-        """Grid of light (n, C), error (n,) and support (n,) at all nodes; holes get the light of the nearest node."""
+        """Grid of light (n, C), error (n,) and support (n,) at all nodes; holes get the light of the nearest node.
+
+        `errors` (n, C) are those of each channel, where several layers are mixed later.
+        """
         shape = tuple(self.spec.shape)
         values, bars, counts = (np.asarray(array, dtype=np.float32) for array in (light, error, support))
         counts = counts.reshape(shape)
         filled = fill_holes(self.spec.spacing, values.reshape(*shape, -1), counts)
-        return IlluminationGrid(self.spec, filled, bars.reshape(shape), counts, channels)  # type: ignore[arg-type]
+        each = None if errors is None else errors.reshape(filled.shape)
+        return IlluminationGrid(self.spec, filled, bars.reshape(shape), counts, channels, each)  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True, eq=False)

@@ -27,17 +27,20 @@ class Nearest:
         light = np.zeros((len(nodes), samples.light.shape[1]), np.float32)
         error = np.full(len(nodes), np.inf, np.float32)
         support = np.zeros(len(nodes), np.float32)
+        errors = None if samples.errors is None else np.full(light.shape, np.inf, np.float32)
         if len(good):
             # Coordinates relative to the grid's origin: differences of large world coordinates would lose digits.
             tree = KDTree(good.queries.point - spec.origin)
-            reach, own_error = diagonal(spec), good.error
+            reach, own_error, own_errors = diagonal(spec), good.error, good.errors
             for block in nodes.blocks(np.flatnonzero(near_samples(spec, good.queries.point, reach)), _SLAB):
                 distance, sample = tree.query(block.point - spec.origin, distance_upper_bound=reach)
                 near = np.isfinite(distance)
                 light[block.flat[near]] = good.light[sample[near]]
                 error[block.flat[near]] = own_error[sample[near]]
                 support[block.flat[near]] = 1.0
-        return nodes.grid(light, error, support, samples.channels)
+                if errors is not None and own_errors is not None:
+                    errors[block.flat[near]] = own_errors[sample[near]]
+        return nodes.grid(light, error, support, samples.channels, errors)
 
 
 @hookimpl

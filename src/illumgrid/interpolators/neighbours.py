@@ -46,7 +46,11 @@ class Sites:
     sheet : (n,) int64
         0 or 1, alternating over the isovalues of the run.
     mean, variance : (n, C), (n,) float64
+    variances : (n, C) float64 or None
+        Of each channel, where several layers are mixed later.
     paths : (n,) float64
+    shown : int
+        How many of the first channels are light as it is shown; the others are layers of it.
     """
 
     point: Floats
@@ -54,7 +58,9 @@ class Sites:
     sheet: NDArray[np.int64]
     mean: Floats
     variance: Floats
+    variances: Floats | None
     paths: Floats
+    shown: int
 
 
 def sites(samples: Samples, nodes: Nodes) -> Sites:
@@ -74,9 +80,15 @@ def sites(samples: Samples, nodes: Nodes) -> Sites:
     share = paths / total[group]
     mean: Floats = np.stack([np.bincount(group, share * light, count) for light in good.light.T], axis=1)
     variance = np.asarray(np.bincount(group, np.square(share * good.error), count), float)
+    variances: Floats | None = None
+    if (errors := good.errors) is not None:
+        squares = np.square(share[:, None] * errors)
+        variances = np.stack([np.bincount(group, square, count).astype(float) for square in squares.T], axis=1)
     levels = np.unique(good.queries.level[:, nodes.number])
     sheet = np.searchsorted(levels, good.queries.level[first, nodes.number]) % 2
-    return Sites(point[first], good.queries.normal[first], sheet, mean, variance, total)
+    return Sites(
+        point[first], good.queries.normal[first], sheet, mean, variance, variances, total, samples.channels.own
+    )
 
 
 class Neighbours(NamedTuple):
@@ -140,6 +152,7 @@ def filled(
     """
     light = np.zeros((len(nodes), samples.light.shape[1]), np.float32)
     error, support = np.full(len(nodes), np.inf, np.float32), np.zeros(len(nodes), np.float32)
+    errors = None if samples.errors is None else np.full(light.shape, np.inf, np.float32)
     places = sites(samples, nodes)
     for around in neighbours(places, nodes, count):
         weight, light[around.node] = weigh(places, around)
@@ -148,4 +161,7 @@ def filled(
         square = np.square(weight)
         error[around.node] = np.sqrt((square * spread).sum(axis=1))
         support[around.node] = 1 / square.sum(axis=1)
-    return nodes.grid(light, error, support, samples.channels)
+        if errors is not None and places.variances is not None:
+            each = np.where((weight != 0)[..., None], places.variances[around.site], 0.0)
+            errors[around.node] = np.sqrt((square[..., None] * each).sum(axis=1))
+    return nodes.grid(light, error, support, samples.channels, errors)

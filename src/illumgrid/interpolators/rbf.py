@@ -22,8 +22,8 @@ def _spline_values(places: Sites, around: Neighbours) -> tuple[Floats, Floats]:
 
     def chunk(rows: slice) -> None:
         weigh(
-            around.point[rows], around.site[rows], around.distance[rows], places.point, places.mean, AMPLIFIES,
-            weight[rows], value[rows], steps[rows],
+            around.point[rows], around.site[rows], around.distance[rows], places.point, places.mean,
+            places.shown, AMPLIFIES, weight[rows], value[rows], steps[rows],
         )  # fmt: skip
 
     chunk(slice(0, 0))  # compiles in the main thread, where Ctrl-C can interrupt it

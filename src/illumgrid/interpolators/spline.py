@@ -59,8 +59,11 @@ def solve_weights(x, ridge, tail, matrix, right, weight):
 
 
 @jit
-def weigh(node, site, distance, point, mean, amplifies, weight, value, steps):
-    """Weights (m, k), values (m, C) and steps of the ridge (m,) for nodes (m, 3) with sites (m, k) around them."""
+def weigh(node, site, distance, point, mean, shown, amplifies, weight, value, steps):
+    """Weights (m, k), values (m, C) and steps of the ridge (m,) for nodes (m, 3) with sites (m, k) around them.
+
+    The first `shown` channels are clamped to the range of their samples; layers are not: they are parts of a sum.
+    """
     m, k = site.shape
     x, own, used = np.zeros((k, 3)), np.zeros(k), np.zeros(k, np.int64)
     matrix, right = np.zeros((k, k)), np.zeros((k, 2))
@@ -104,4 +107,4 @@ def weigh(node, site, distance, point, mean, amplifies, weight, value, steps):
                 light = mean[site[number, used[i]], c]
                 low, high = min(low, light), max(high, light)
                 total += own[i] * light
-            value[number, c] = min(max(total, low), high)
+            value[number, c] = min(max(total, low), high) if c < shown else total

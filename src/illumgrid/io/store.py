@@ -2,7 +2,8 @@
 
 ``illumination.exr`` is a multi-part OpenEXR file, float32, scan lines, ZIP. Each field has two parts,
 
-- ``light/<field name>``: the channels of its illumination grid (R, G, B; or Y, where it is grey), error and support;
+- ``light/<field name>``: the channels of its illumination grid (R, G, B; or Y, where it is grey), error and support; of
+  several lights also each alone, ``key.Y`` (to be multiplied by the light's colour) or ``key.R``, and ``key.Y.error``;
 - ``field/<field name>``: channel Y, the field's values as they were used;
 
 and each quad one, ``wall/<quad name>``: light and support of its texels, (nu, nv, rows of the level table).
@@ -28,6 +29,7 @@ import OpenEXR
 from numpy.typing import NDArray
 
 from illumgrid.errors import BadInput
+from illumgrid.field.lights import Distant, Harmonics, Light, Sky
 from illumgrid.field.scene import Field, Levels, Material, Quad, Scene
 from illumgrid.field.volume import Lattice, Volume
 from illumgrid.grid import RGB, Channels, GridSpec, IlluminationGrid, WallTexture
@@ -38,6 +40,11 @@ FORMAT = 2  # 1 had RGB only
 EXR, RUN, PREVIEW = "illumination.exr", "run.json", "preview.png"
 PLACE = ("origin", "spacing", "direction")
 EDGES = ("corner", "edge_u", "edge_v")
+KINDS = {
+    "Sky": ("name", "radiance"),
+    "Distant": ("name", "direction", "angle", "irradiance"),
+    "Harmonics": ("name", "coefficients"),
+}
 LAYOUT = "array (nx, ny, nz) = ({}, {}, {}); row = z*ny + y, column = x"
 DEFLATE_AT_MOST = 1032  # bytes out for one byte in: a file that claims more is refused before memory is asked for
 AGAIN = "give a folder that 'illumgrid run' wrote, or run it again"
@@ -208,7 +215,7 @@ def _describe(stored: Stored) -> Record:
         for f in stored.scene.fields
     ]
     quads = [
-        {"name": q.name, "texels": list(q.texels)}
+        {"name": q.name, "texels": list(q.texels), "light": q.light}
         | {name: getattr(q, name).tolist() for name in EDGES}
         | {"albedo": q.material.albedo.tolist(), "emission": q.material.emission.tolist()}
         for q in stored.scene.quads
@@ -218,13 +225,29 @@ def _describe(stored: Stored) -> Record:
     record = {
         "format": FORMAT,
         "illumgrid": version("illumgrid"),
-        "scene": {"fields": fields, "quads": quads, "background": stored.scene.background.tolist()},
+        "scene": {"fields": fields, "quads": quads, "background": stored.scene.background.tolist()}
+        | {"lights": [_described(light) for light in stored.scene.lights]},
         "levels": np.asarray(stored.levels.table, float).tolist(),
         "grids": {f.name: lattice(grid.spec) for f, grid in zip(stored.scene.fields, stored.grids)},
         "channels": {part: asdict(channels) for part, channels in lit.items()},
         "recipe": stored.recipe,
     }
     return dict(json.loads(json.dumps(record, allow_nan=False)))
+
+
+def _described(light: Light) -> Record:
+    parts = {key: getattr(light, key) for key in KINDS[type(light).__name__]}
+    return {"kind": type(light).__name__} | {
+        k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in parts.items()
+    }
+
+
+def _light(about: Record) -> Light:
+    if about["kind"] not in KINDS:
+        raise BadInput(f"a light of kind {str(about['kind'])[:40]!r} came; expected one of {', '.join(KINDS)}")
+    kind: Any = {cls.__name__: cls for cls in (Sky, Distant, Harmonics)}[about["kind"]]
+    light: Light = kind(*(about[key] for key in KINDS[about["kind"]]))
+    return light
 
 
 def _checksum(record: Record, exr: Path) -> str:
@@ -254,7 +277,8 @@ def _rebuild(record: Record, parts: dict[str, dict[str, Image]]) -> Stored:
             parts.pop(part),
         )
         values, error, support = (_array(light, names, spec.shape) for names in (channels.names, "error", "support"))
-        grids.append(IlluminationGrid(spec, values, error, support, channels))
+        errors = _array(light, tuple(_errors(channels)), spec.shape) if _errors(channels) else None
+        grids.append(IlluminationGrid(spec, values, error, support, channels, errors))
         values = _array(parts.pop(f"field/{about['name']}"), "Y", _shape(about))
         origin, spacing, direction = (about[k] for k in PLACE)
         slope, intercept = about.get("slope", 1.0), about.get("intercept", 0.0)
@@ -270,8 +294,9 @@ def _rebuild(record: Record, parts: dict[str, dict[str, Image]]) -> Stored:
         walls.append(WallTexture(values, np.ascontiguousarray(support), channels))
         material = Material(about["albedo"], about["emission"])
         corner, edge_u, edge_v = (np.array(about[name], float) for name in EDGES)
-        quads.append(Quad(about["name"], corner, edge_u, edge_v, material, (shape[0], shape[1])))
-    scene = Scene(tuple(fields), tuple(quads), record["scene"]["background"])
+        quads.append(Quad(about["name"], corner, edge_u, edge_v, material, (shape[0], shape[1]), about.get("light")))
+    lights = tuple(map(_light, record["scene"].get("lights", [])))
+    scene = Scene(tuple(fields), tuple(quads), record["scene"]["background"], lights)
     return Stored(scene, Levels(np.array(record["levels"], float)), tuple(grids), tuple(walls), record["recipe"])
 
 
@@ -298,11 +323,17 @@ def _channels(record: Record, part: str) -> Channels:
     raise BadInput(f"the channels of {part!r} are {str(record['channels'][part])[:80]}; expected names and their mix")
 
 
+def _errors(channels: Channels) -> list[str]:
+    """Names of the channels of a file that hold the errors of lights that are kept apart."""
+    return [f"{name}.error" for name in channels.names] if channels.mixable else []
+
+
 def _plan(record: Record) -> Plan:
     plan: Plan = {}
     for about in record["scene"]["fields"]:
         part = f"light/{about['name']}"
-        names = sorted((*_channels(record, part).names, "error", "support"))
+        channels = _channels(record, part)
+        names = sorted((*channels.names, *_errors(channels), "error", "support"))
         plan[part] = _shape(record["grids"][about["name"]]), names
         plan[f"field/{about['name']}"] = _shape(about), ["Y"]
     for about in record["scene"]["quads"]:
@@ -331,6 +362,9 @@ def _write_exr(path: Path, stored: Stored) -> None:
     arrays: dict[str, dict[str, Image]] = {}
     for f, grid in zip(stored.scene.fields, stored.grids):
         arrays[f"light/{f.name}"] = split(grid) | {"error": grid.error, "support": grid.support}
+        if names := _errors(grid.channels):
+            errors = np.full(grid.light.shape, np.inf, np.float32) if grid.errors is None else grid.errors
+            arrays[f"light/{f.name}"] |= {name: errors[..., c] for c, name in enumerate(names)}
         arrays[f"field/{f.name}"] = {"Y": f.volume.values}
     for quad, wall in zip(stored.scene.quads, stored.walls):
         turned = split(wall) | {"support": wall.support}

@@ -4,7 +4,8 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from illumgrid.show.camera import UPS, VIEWS, Camera, fit_camera, widest_row
+    from illumgrid.field.upright import UPS
+    from illumgrid.show.camera import VIEWS, Camera, fit_camera, widest_row
     from illumgrid.show.engines import ENGINES, choose_engine
     from illumgrid.show.picture import grid_volume, png, render, strip
     from illumgrid.show.shade import BACKGROUND, CAP_TONE
@@ -15,10 +16,11 @@ __all__ = [
 ]  # fmt: skip
 
 _HOMES = {
-    "camera": ("UPS", "VIEWS", "Camera", "fit_camera", "widest_row"),
-    "engines": ("ENGINES", "choose_engine"),
-    "picture": ("grid_volume", "png", "render", "strip"),
-    "shade": ("BACKGROUND", "CAP_TONE"),
+    "show.camera": ("VIEWS", "Camera", "fit_camera", "widest_row"),
+    "show.engines": ("ENGINES", "choose_engine"),
+    "show.picture": ("grid_volume", "png", "render", "strip"),
+    "show.shade": ("BACKGROUND", "CAP_TONE"),
+    "field.upright": ("UPS",),
 }
 _HOME = {name: home for home, names in _HOMES.items() for name in names}
 
@@ -27,4 +29,4 @@ def __getattr__(name: str) -> Any:
     """Import a name where it is first used: the engines and Pillow are heavy."""
     if name not in _HOME:
         raise AttributeError(f"module 'illumgrid.show' has no attribute {name!r}")
-    return getattr(importlib.import_module(f"illumgrid.show.{_HOME[name]}"), name)
+    return getattr(importlib.import_module(f"illumgrid.{_HOME[name]}"), name)

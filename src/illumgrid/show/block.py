@@ -6,9 +6,10 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from illumgrid.field.upright import axes_of
 from illumgrid.field.volume import Floats, index_to_world
 from illumgrid.grid import GridSpec, read_lattice
-from illumgrid.show.camera import Camera, axes_of
+from illumgrid.show.camera import Camera
 from illumgrid.show.engines import software
 from illumgrid.show.shade import Colors, Shown, opaque
 from illumgrid.show.triangles import Colored, squares

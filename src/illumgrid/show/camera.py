@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from illumgrid.errors import BadInput
-from illumgrid.field.boundaries import otsu_threshold
 from illumgrid.field.levelset import turned, turned_levels
 from illumgrid.field.scene import Scene
+from illumgrid.field.upright import axes_of, up_of
 from illumgrid.field.volume import Floats, box_corners, index_to_world
 
 HALF_ANGLE = 0.27  # tangent of half the vertical angle of view, 30 degrees in all
@@ -20,11 +20,6 @@ VIEWS = {
     "top": (0.0, 90.0), "bottom": (0.0, -90.0), "iso": (45.0, math.degrees(math.asin(1 / math.sqrt(3)))),
 }  # fmt: skip
 """Azimuth and elevation in degrees: from the front to the right, and upwards."""
-
-UPS = {
-    f"{sign}{name}": factor * axis for sign, factor in (("", 1.0), ("-", -1.0)) for name, axis in zip("xyz", np.eye(3))
-}
-"""World directions (3,) that can be up."""
 
 View = str | tuple[float, float] | None
 
@@ -72,48 +67,6 @@ def camera_of(text: str) -> Camera:
     return Camera(eye, right, up, forward, tangent)
 
 
-def axes_of(direction: Floats, up: str = "z") -> tuple[Floats, Floats, Floats]:
-    """World directions (3,) right, front, up along the axes of an array with this `direction`.
-
-    Up is the array axis nearest to the world direction `up`. The front is the one nearest to -y (the face, in medical
-    coordinates); where y is vertical, the one from which +x points to the right.
-    """
-    if up not in UPS:
-        raise BadInput(f"up is {up!r}; expected one of {', '.join(UPS)}")
-    wanted = UPS[up]
-    facing = np.cross(UPS["x"], wanted) if up.endswith("y") else UPS["-y"]
-    heights = direction.T @ wanted
-    vertical = int(np.argmax(np.abs(heights)))
-    depths = np.where(np.arange(3) == vertical, 0.0, direction.T @ facing)
-    level = int(np.argmax(np.abs(depths)))
-    upward_axis = direction[:, vertical] * np.sign(heights[vertical])
-    front = direction[:, level] * (np.sign(depths[level]) or 1.0)
-    return np.cross(upward_axis, front), front, upward_axis
-
-
-FLAT, ROUND = 0.3, 0.05  # area of an end over the largest section: a flat cut, a rounded end
-
-
-def up_of(scene: Scene) -> str:
-    """The default up: world +z, or -z for an object that would stand on its head.
-
-    Only an array without orientation (identity axes at the origin: its file states none) in a scene without walls is
-    turned over, and only if the object, as Otsu's threshold finds it, ends in a flat cut on top and is rounded below: a
-    bust stands on its neck.
-    """
-    first = scene.fields[0]
-    stated = (first.volume.direction != np.eye(3)).any() or first.volume.origin.any()
-    if stated or scene.quads or len(scene.fields) > 1:
-        return "z"
-    try:
-        level = first.volume.to_stored(otsu_threshold(first.volume, first.inside))
-    except BadInput:  # constant
-        return "z"
-    areas = first.solid(first.volume.values, level).sum(axis=(0, 1))
-    ends = areas[areas > 0][[0, -1]] / areas.max()
-    return "-z" if ends[1] > FLAT and ends[0] < ROUND else "z"
-
-
 def angles(view: str | tuple[float, float]) -> tuple[float, float]:
     """Azimuth and elevation, in degrees, of a named view or of ``"azimuth,elevation"``.
 
@@ -159,7 +112,7 @@ def outline_of(scene: Scene, row: Floats) -> Floats:
             found.append(index_to_world(field.volume, np.insert(ends[:, :2], axis, ends[:, 2], axis=1)))
     if not sum(map(len, found)):
         found = [box_corners(f.volume) for f in scene.fields]
-    for quad in () if scene.background.any() else scene.quads:  # a room is seen whole, a floor under a sky goes on
+    for quad in () if scene.open else scene.quads:  # a room is seen whole, a floor under a sky goes on
         found.append(quad.corner + np.array([np.zeros(3), quad.edge_u, quad.edge_v, quad.edge_u + quad.edge_v]))
     return np.concatenate(found)
 
@@ -205,7 +158,7 @@ def fit_camera(
     axes = axes_of(scene.fields[0].volume.direction, up_of(scene) if up is None else up)
     if view is None:
         extent = np.ptp(outline @ np.stack(axes, axis=1), axis=0)
-        flat, closed = extent[2] < 0.5 * extent[:2].min(), not scene.background.any()
+        flat, closed = extent[2] < 0.5 * extent[:2].min(), not scene.open
         view = 0.0 if closed else 30.0, 60.0 if flat else 6.0 if closed else 18.0
     return camera_around(outline, axes, aspect, view, zoom, roll)
 

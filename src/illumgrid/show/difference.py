@@ -82,7 +82,7 @@ def studio(
     )
 
     def picture(grids: list[Any]) -> NDArray[np.float32]:
-        light = Shown(scene, level_table(scene, 2), tuple(grids), walls, {}, exposure)
+        light = Shown(scene, level_table(scene, 2), tuple(grids), walls, {}, {}, exposure)
         isovalue = float(scene.levels(PLACE)[0, 0])
         shown = render(light, isovalue=isovalue, width=height * 4 // 3, height=height)
         return shown.astype(np.float32) / np.float32(255)

@@ -9,11 +9,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from illumgrid.errors import BadInput
+from illumgrid.field.upright import axes_of, up_of
 from illumgrid.field.volume import box_corners
 from illumgrid.light import Illumination
 from illumgrid.show import triangles
 from illumgrid.show.block import Block
-from illumgrid.show.camera import Camera, View, axes_of, camera_around, fit_camera, outline_of, up_of
+from illumgrid.show.camera import Camera, View, camera_around, fit_camera, outline_of
 from illumgrid.show.captions import isovalues_of, labelled, scale_bar
 from illumgrid.show.engines import choose_engine, gl, software
 from illumgrid.show.shade import BACKGROUND, Colors, Shown, opaque

@@ -13,7 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from illumgrid.field.lights import Distant, Sky, pixel_directions
 from illumgrid.field.scene import Field, Material, Quad, Scene, box_around, upright
+from illumgrid.field.upright import sky_axes
 from illumgrid.field.volume import Floats, Volume, index_to_world
 from illumgrid.transport.samples import Queries, join_queries
 from illumgrid.transport.stages import on_level_sets
@@ -324,6 +326,63 @@ def balance() -> Case:
     return Case("energy in the box", scene, queries, power[None], bound, 3, reason, area, kept)
 
 
+def _facing_up() -> tuple[Field, Queries, Floats]:
+    """Black plane whose solid is below in the array, queries on it, and its normal in the world."""
+    field = _field("plane", -np.indices((9, 9, 9))[2], (-6.0, -1.0), 0.0, False, direction=_TURN)
+    index = np.column_stack([0.3 + 7.4 * _pairs(6, 9), np.full(72, 4.0)])
+    queries = Queries.at(Scene((field,)), index_to_world(field.volume, index))
+    return field, queries, queries.normal[0]
+
+
+def _tilted(normal: Floats, angle: float) -> Floats:
+    """Unit vector (3,) at this angle from a normal."""
+    across = np.cross(normal, [0.6, -0.3, 0.7])
+    return np.asarray(np.cos(angle) * normal + np.sin(angle) * across / np.linalg.norm(across))
+
+
+def disc() -> Case:
+    """Discs of the sky: E = π L sin²α cos θ for half-angle α at angle θ from the normal, θ + α <= π/2. Exact.
+
+    A soft key, and a sun: hardly any path finds it by chance. Both are asked for by the same rays.
+    """
+    field, queries, normal = _facing_up()
+    lights = tuple(
+        Distant(name, _tilted(normal, theta), alpha, color)
+        for name, theta, alpha, color in (("key", 0.7, 25.0, (3.0, 2.0, 1.0)), ("sun", -0.5, 0.27, (1.0, 2.0, 0.5)))
+    )
+    truth = sum(light.irradiance * (light.direction @ normal) for light in lights)
+    scene = Scene((field,), lights=lights)
+    return _case("discs of the sky", scene, queries, truth, 0, "E = π L sin²α cos θ")
+
+
+def _pictured(name: str, radiance: Any, reason: str, expected: float, field: Field, queries: Queries) -> Case:
+    """Case under an image of a sky, brightest at 1; `radiance` of the cosine to the normal's tilted axis.
+
+    The image is bilinear: h²/8 of the second derivative, at most n for the n-th power of a cosine, along both axes.
+    """
+    rows = 128
+    axes = sky_axes(Scene((field,)))
+    image = radiance(pixel_directions(rows, 2 * rows)[0] @ axes)
+    scene = Scene((field,), lights=(Sky(name, np.repeat(image[..., None], 3, axis=-1)),))
+    bound = 2 * np.pi * (np.pi / rows) ** 2 / 8 * 4 * expected
+    return _case(f"{name} sky", scene, queries, expected, 0, reason, bound)
+
+
+def clamped_cosine() -> Case:
+    """Sky of radiance max(0, ω·k) at angle γ from the normal: E = ⅔ (sin γ + (π - γ) cos γ)."""
+    field, queries, normal = _facing_up()
+    axis, angle = _tilted(normal, 1.1), 1.1
+    truth = 2 / 3 * (np.sin(angle) + (np.pi - angle) * np.cos(angle))
+    reason = "E = ⅔(sin γ + (π - γ)cos γ)"
+    return _pictured("cosine", lambda d: np.maximum(d @ axis, 0.0), reason, truth, field, queries)
+
+
+def lobe() -> Case:
+    """Sky of radiance max(0, ω·n)⁴ above the normal: E = 2π/6."""
+    field, queries, normal = _facing_up()
+    return _pictured("lobe", lambda d: np.maximum(d @ normal, 0.0) ** 4, "E = 2π/(n + 2)", np.pi / 3, field, queries)
+
+
 CASES = (
     furnace,
     furnace_on_voxels,
@@ -337,4 +396,7 @@ CASES = (
     half_sky,
     gray_box,
     balance,
+    disc,
+    clamped_cosine,
+    lobe,
 )

@@ -150,12 +150,20 @@ class Samples:
     def __getitem__(self, rows: slice | NDArray[np.bool_] | NDArray[np.integer]) -> "Samples":
         return Samples(self.queries[rows], self.light[rows], self.spread[rows], self.paths[rows], self.channels)
 
+    def _stderr(self, m2: NDArray[np.float32]) -> NDArray[np.float32]:
+        n = self.paths[:, None].astype(float)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.where(n >= 2, np.sqrt(m2 / (n * (n - 1))), np.inf).astype(np.float32)
+
     @property
     def stderr(self) -> NDArray[np.float32]:
         """Standard error (n, 3) of the mean: stderr² = m2 / (paths (paths - 1)); infinite below two paths."""
-        n = self.paths[:, None].astype(float)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            return np.where(n >= 2, np.sqrt(self.m2 / (n * (n - 1))), np.inf).astype(np.float32)
+        return self._stderr(self.m2)
+
+    @property
+    def errors(self) -> NDArray[np.float32] | None:
+        """Standard error (n, C) of each channel, where lights are kept apart; else None."""
+        return self._stderr(self.spread) if self.channels.mixable else None
 
     @property
     def error(self) -> NDArray[np.float32]:

@@ -5,11 +5,9 @@ from contextvars import ContextVar
 from dataclasses import dataclass
 from typing import Any, Protocol, cast
 
-import numpy as np
-
 from illumgrid.field.levelset import Marchable, marchable
 from illumgrid.field.scene import Scene
-from illumgrid.grid.channels import Channels, channels_of
+from illumgrid.grid.channels import Channels, channels_of, columns_of
 from illumgrid.transport.samples import Queries, Samples
 from illumgrid.transport.stages import Backend
 
@@ -44,14 +42,9 @@ def prepare(backend: Backend, scene: Scene) -> Tracer:
 def laid_out(scene: Scene) -> tuple[Channels, Marchable]:
     """Channels of a scene, and the scene laid out for marching, with albedos and light per channel.
 
-    All channels use the same paths. A channel has the first colour that it adds to; the channel of one of several
-    lights would have the emission of that light only.
+    All channels use the same paths.
     """
-    channels, fields = channels_of(scene), marchable(scene)
-    color = [int(np.argmax(row)) for row in channels.mix]
-    tables = ("albedo", "emission", "background", "lamplight")
-    own = {name: np.ascontiguousarray(getattr(fields, name)[..., color]) for name in tables}
-    return channels, fields._replace(**own)
+    return channels_of(scene), marchable(scene, columns_of(scene))
 
 
 def solve_once(backend: Any, scene: Scene, queries: Queries, *, paths: range, bounces: int, seed: int) -> Samples:

@@ -12,11 +12,11 @@ import numpy as np
 from illumgrid.errors import shown_range
 from illumgrid.field.levelset import turned
 from illumgrid.field.scene import Field, Scene
+from illumgrid.field.upright import axes_of, up_of
 from illumgrid.field.volume import Floats, Lattice, box_corners
-from illumgrid.grid import GREY
 from illumgrid.light import Illumination
 from illumgrid.show import trust
-from illumgrid.show.camera import HALF_ANGLE, axes_of, fit_camera, outline_of, up_of
+from illumgrid.show.camera import HALF_ANGLE, fit_camera, outline_of
 from illumgrid.show.shade import BACKGROUND, CAP_TONE
 from illumgrid.show.viewer.arrays import HOLE, Bytes, field_steps, pack_light, pack_values, reduced, thinned
 from illumgrid.tone import WHITE, encode_srgb
@@ -79,7 +79,7 @@ def _field(light: Illumination, number: int, stage: Stage, into: Bytes, notes: l
     texture[:3, 3] = 0.5 / np.array(grid.spec.shape)
     albedo = field.material.albedo
     error = np.where(np.isfinite(grid.bar), trust.relative(whole, grid.bar), HOLE)
-    shown = grid.light if grid.channels == GREY else grid.values
+    shown = grid.channels.shown(grid.light)
     return {
         "name": field.name,
         "range": field.range.tolist(),
@@ -114,11 +114,11 @@ def _walls(light: Illumination, stage: Stage, into: Bytes) -> tuple[list[dict[st
     if not quads:
         return [], None
     rows, wide, high = len(light.levels.table), sum(q.texels[0] for q in quads), max(q.texels[1] for q in quads)
-    grey = all(wall.channels == GREY for wall in light.walls)
+    grey = all(wall.channels.grey for wall in light.walls)
     atlas, offset, described = np.zeros((wide, high, rows, 1 if grey else 3), np.float32), 0, []
     for quad, wall in zip(quads, light.walls):
         nu, nv = quad.texels
-        lit = wall.light if grey else wall.values
+        lit = wall.channels.shown(wall.light) if grey else wall.values
         atlas[offset : offset + nu, :nv] = lit.transpose(2, 1, 0, 3) * (light.exposure / np.pi)
         material = quad.material
         described.append(

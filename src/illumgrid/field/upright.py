@@ -1,0 +1,61 @@
+"""Which way is up: signed axes of the array, for cameras and skies."""
+
+import numpy as np
+
+from illumgrid.errors import BadInput
+from illumgrid.field.boundaries import otsu_threshold
+from illumgrid.field.scene import Scene
+from illumgrid.field.volume import Floats
+
+UPS = {
+    f"{sign}{name}": factor * axis for sign, factor in (("", 1.0), ("-", -1.0)) for name, axis in zip("xyz", np.eye(3))
+}
+"""World directions (3,) that can be up."""
+
+
+def axes_of(direction: Floats, up: str = "z") -> tuple[Floats, Floats, Floats]:
+    """World directions (3,) right, front, up along the axes of an array with this `direction`.
+
+    Up is the array axis nearest to the world direction `up`. The front is the one nearest to -y (the face, in medical
+    coordinates); where y is vertical, the one from which +x points to the right.
+    """
+    if up not in UPS:
+        raise BadInput(f"up is {up!r}; expected one of {', '.join(UPS)}")
+    wanted = UPS[up]
+    facing = np.cross(UPS["x"], wanted) if up.endswith("y") else UPS["-y"]
+    heights = direction.T @ wanted
+    vertical = int(np.argmax(np.abs(heights)))
+    depths = np.where(np.arange(3) == vertical, 0.0, direction.T @ facing)
+    level = int(np.argmax(np.abs(depths)))
+    upward_axis = direction[:, vertical] * np.sign(heights[vertical])
+    front = direction[:, level] * (np.sign(depths[level]) or 1.0)
+    return np.cross(upward_axis, front), front, upward_axis
+
+
+FLAT, ROUND = 0.3, 0.05  # area of an end over the largest section: a flat cut, a rounded end
+
+
+def up_of(scene: Scene) -> str:
+    """The default up: world +z, or -z for an object that would stand on its head.
+
+    Only an array without orientation (identity axes at the origin: its file states none) in a scene without walls is
+    turned over, and only if the object, as Otsu's threshold finds it, ends in a flat cut on top and is rounded below: a
+    bust stands on its neck.
+    """
+    first = scene.fields[0]
+    stated = (first.volume.direction != np.eye(3)).any() or first.volume.origin.any()
+    if stated or scene.quads or len(scene.fields) > 1:
+        return "z"
+    try:
+        level = first.volume.to_stored(otsu_threshold(first.volume, first.inside))
+    except BadInput:  # constant
+        return "z"
+    areas = first.solid(first.volume.values, level).sum(axis=(0, 1))
+    ends = areas[areas > 0][[0, -1]] / areas.max()
+    return "-z" if ends[1] > FLAT and ends[0] < ROUND else "z"
+
+
+def sky_axes(scene: Scene) -> Floats:
+    """World directions right, back and up, the rows of (3, 3): the axes in which skies are described."""
+    right, front, up = axes_of(scene.fields[0].volume.direction, up_of(scene))
+    return np.stack([right, -front, up])
