@@ -200,5 +200,7 @@ class Illumination:
 
         store.claim(folder, overwrite)
         picture = png(render(self)) if preview else None
-        recipe = {**self.recipe, "exposure": self.exposure, "weights": dict(self.weights)}
+        recipe = {**self.recipe, "exposure": self.exposure}
+        if self.weights:
+            recipe["weights"] = dict(self.weights)
         store.write(folder, store.Stored(self.scene, self.levels, self.grids, self.walls, recipe), picture, overwrite)

@@ -347,7 +347,7 @@ def disc() -> Case:
     """
     field, queries, normal = _facing_up()
     lights = tuple(
-        Distant(name, _tilted(normal, theta), alpha, color)
+        Distant(name, _tilted(normal, theta), alpha, np.array(color))
         for name, theta, alpha, color in (("key", 0.7, 25.0, (3.0, 2.0, 1.0)), ("sun", -0.5, 0.27, (1.0, 2.0, 0.5)))
     )
     truth = sum(light.irradiance * (light.direction @ normal) for light in lights)
