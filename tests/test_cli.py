@@ -36,7 +36,7 @@ def test_a_run_leaves_light_a_record_and_a_picture(call, tmp_path):
     made = recipe(out)
     assert made["input"] == "v.npy" and made["smooth"] == 0 and made["warnings"] == [] and made["exposure"] > 0
     light = ig.load(out)
-    scene = ig.Scene.sky(ig.read_volume(tmp_path / "v.npy"), range=(0.3, 0.9), name="v")
+    scene = ig.Scene.studio(ig.read_volume(tmp_path / "v.npy"), range=(0.3, 0.9), name="v")
     assert np.array_equal(light.grids[0].values, ig.run(scene, grid=8, paths=2, bounces=1).grids[0].values)
 
 
@@ -44,7 +44,7 @@ def test_without_options_the_folder_is_named_after_the_input_and_the_range_comes
     call("run", "v.npy", *QUICK, "--no-preview")
     assert sorted(p.name for p in (tmp_path / "v-light").iterdir()) == ["illumination.exr", "run.json"]
     field = ig.load(tmp_path / "v-light").scene.fields[0]
-    assert field.name == "v" and field.inside == "above" and field.material.albedo.tolist() == [0.8] * 3
+    assert field.name == "v" and field.inside == "above" and field.material.albedo.tolist() == [0.65] * 3
     assert tuple(field.range) == ig.suggest_range(field.volume)[:2]
 
 

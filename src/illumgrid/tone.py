@@ -10,8 +10,8 @@ WHITE = 0.8
 EVEN = (0.9, WHITE)
 """Share of the light, and display radiance that it may not exceed: highlights begin to lose contrast there."""
 
-DIRECTED = (0.95, 0.65)
-"""The same under a light from one side: sRGB 209 leaves the forms on the lit side their shades. In default previews of
+DIRECTED = (0.95, 0.63)
+"""The same under a light from one side: sRGB 206 leaves the forms on the lit side their shades. In default previews of
 13 volumes the 95th percentile of the object's pixels then lies at 205 to 220."""
 
 

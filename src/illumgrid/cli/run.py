@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from illumgrid.light import Illumination
 
 
-AROUND = ("studio", "floor", "sky", "box")
+AROUND = ("studio", "sky", "floor", "box")
 """Scenes around a volume, by the names of their constructors; the first is the default."""
 
 
@@ -202,7 +202,7 @@ def run(
     ] = None,
     surroundings: Annotated[
         str | None,
-        typer.Option("--scene", help="What is around a volume: studio, floor, sky, box (and lamp). [default: studio]"),
+        typer.Option("--scene", help="What is around a volume: studio, sky, floor, box (and lamp). [default: studio]"),
     ] = None,
     albedo: Annotated[
         tuple[float, float, float] | None,

@@ -10,8 +10,8 @@ from illumgrid.field.volume import Floats
 ALBEDO = (0.65, 0.65, 0.65)
 """Neutral, and not so white that light between its folds washes out their shadows."""
 KEY, DOME = "key", "dome"
-AZIMUTH, ELEVATION, ANGLE = -15.0, 40.0, 25.0
-"""Of the key, degrees: 45 to the left of the default view, which is 30 to the right of the front; half its size."""
+AZIMUTH, ELEVATION, ANGLE = -20.0, 40.0, 25.0
+"""Of the key, degrees: 50 to the left of the default view, which is 30 to the right of the front; half its size."""
 RATIO = 16.0
 """Irradiance by the key over that by the dome, on a surface that faces the key."""
 WARM, COOL = (1.03, 1.0, 0.94), (0.92, 0.99, 1.09)
