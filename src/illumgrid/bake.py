@@ -15,6 +15,7 @@ from illumgrid.field.volume import interpolate, world_to_index
 from illumgrid.grid import GridSpec, IlluminationGrid, Nodes, WallTexture, channels_of, fill_holes
 from illumgrid.grid.channels import Channels
 from illumgrid.grid.nodes import reachable
+from illumgrid.grid.walls import calmed
 from illumgrid.samplers.direct import Direct
 from illumgrid.stages import Interpolator, Sampler
 from illumgrid.transport.samples import Queries, Samples, combine, join_queries, join_samples
@@ -219,7 +220,11 @@ def _wall_texture(rows: int, quad: Quad, answer: Samples) -> WallTexture:
     texel = np.linalg.norm(quad.edge_v) / nv, np.linalg.norm(quad.edge_u) / nu
     # Another row is another setting of the sweep: look there last.
     spacing = (1e3 * max(texel) * max(nu, nv), *texel)
-    light = fill_holes(spacing, answer.light.reshape(rows, nv, nu, -1), support)
+    shape = rows, nv, nu
+    calm = calmed(
+        answer.light.reshape(*shape, -1), answer.mean.reshape(*shape, 3), answer.error.reshape(shape), support
+    )
+    light = fill_holes(spacing, calm, support)
     return WallTexture(light, support, answer.channels)
 
 

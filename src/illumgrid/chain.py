@@ -12,6 +12,7 @@ import numpy as np
 from illumgrid import registry
 from illumgrid.accuracy.choose import JUDGED, Plan, planned
 from illumgrid.accuracy.judge import judge as measure_error
+from illumgrid.accuracy.judge import judge_walls as measure_walls
 from illumgrid.accuracy.probe import FEWEST_PATHS, MOST_PATHS
 from illumgrid.bake import Map, Progress, bake, enough_bounces, light_left_out
 from illumgrid.constants import PATHS
@@ -162,6 +163,7 @@ def run(
         "plan": None if plan is None else asdict(plan),
         "reached": None,
         "reached_uncertain": None,
+        "reached_on_walls": None,
         "versions": {name: version(name) for name in ("illumgrid", "numpy", "numba", "scipy")},
     }
     light = Illumination(scene, levels, baked.grids, baked.walls, recipe)
@@ -172,8 +174,8 @@ def judged(light: Illumination, backend: Backend) -> Illumination:
     """The same light with the error that it reached in its recipe; never raises.
 
     ``reached`` is the relative root mean square error at points that the run did not ask for, ``reached_uncertain`` its
-    standard error. A result is judged on its own surface or not at all: both are None for a backend that traces meshes
-    or computes no light transport, and in the dark.
+    standard error, and ``reached_on_walls`` that error on walls. A result is judged on its own surface or not at all:
+    all are None for a backend that traces meshes or computes no light transport, and in the dark.
 
     Parameters
     ----------
@@ -189,12 +191,16 @@ def judged(light: Illumination, backend: Backend) -> Illumination:
         tracer = prepare(registry.backend("auto"), light.scene)  # of the same surface, and quick
         about = (recipe[key] for key in ("seed", "queries", "paths", "bounces"))
         found = measure_error(light.scene, tracer, light.grids, *about)
+        texels = (recipe[key] for key in ("seed", "texels", "texel_paths", "bounces"))
+        on_walls = measure_walls(light.scene, tracer, light.walls, *texels) if light.walls else None
     except Exception as reason:  # a finished run is worth more than its judgement
         tell("error", f"the error reached could not be measured ({type(reason).__name__}: {reason})", stacklevel=2)
         return light
     if found is None:
         return light
-    return replace(light, recipe={**recipe, "reached": found.rmse, "reached_uncertain": found.uncertain})
+    reached = {"reached": found.rmse, "reached_uncertain": found.uncertain}
+    walls = None if on_walls is None else on_walls.rmse
+    return replace(light, recipe={**recipe, **reached, "reached_on_walls": walls})
 
 
 def _shines(scene: Scene) -> bool:

@@ -1,39 +1,61 @@
 """The error that a finished run has reached, and what would lessen it."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
 from illumgrid.accuracy.points import unseen_in_volume
 from illumgrid.accuracy.probe import Probe
-from illumgrid.accuracy.reference import Errors, begin, enough, errors, look_up
+from illumgrid.accuracy.reference import Errors, Reference, begin, enough, errors, look_up
+from illumgrid.accuracy.walls import look_up_walls, unseen_on_walls
 from illumgrid.bake import shifted_seed
 from illumgrid.errors import BadInput
 from illumgrid.field.lattice import specs_over
 from illumgrid.field.scene import Scene
 from illumgrid.field.volume import smooth
-from illumgrid.grid import GridSpec, IlluminationGrid
+from illumgrid.grid import GridSpec, IlluminationGrid, WallTexture
 from illumgrid.stages import Backend
+from illumgrid.transport.samples import Queries
 from illumgrid.transport.tracer import Tracer, prepare
 
 
 def judge(
     scene: Scene, tracer: Tracer, grids: Sequence[IlluminationGrid], seed: int, queries: int, paths: int, bounces: int
 ) -> Errors | None:
-    """Error of grids at points that neither they nor the probe asked for; None where there is no light or no surface.
+    """Error of grids at points that no run asks for; None where there is no light or no surface."""
+    unseen = partial(unseen_in_volume, scene)
+    reference = _reference(scene, tracer, unseen, shifted_seed(seed, 2), queries * paths, paths, bounces)
+    return errors(look_up(grids, reference.queries), reference) if reference.mean > 0 else None
+
+
+def judge_walls(
+    scene: Scene, tracer: Tracer, walls: Sequence[WallTexture], seed: int, texels: int, paths: int, bounces: int
+) -> Errors | None:
+    """As `judge`, of the light of walls, at places between texels and rows of the sweep; None without walls to show.
+
+    Walls behind nothing are smooth and many, so that an error at shadows alone counts little: see `Errors.p95`.
+    """
+    unseen = partial(unseen_on_walls, scene)
+    reference = _reference(scene, tracer, unseen, shifted_seed(seed, 3), texels * paths, paths, bounces)
+    return errors(look_up_walls(scene, walls, reference.queries), reference) if reference.mean > 0 else None
+
+
+def _reference(
+    scene: Scene, tracer: Tracer, unseen: Callable[[int, int], Queries], seed: int, work: int, paths: int, bounces: int
+) -> Reference:
+    """Light at unseen points.
 
     For a twentieth of the run's work, or what 1024 points take: as many paths as the grids had, which makes the
     reference as sharp as they are, and the more points, for where the light is rough a few of them carry the error.
     The path count is fixed in advance; stopping once the reference looks sharp enough would bias the estimate.
     """
     followed = enough(scene, tracer, 1e-3, seed)
-    work = queries * paths * (bounces + 1) / (20 * (followed + 1))
-    points = int(np.clip(work / max(paths, 1), 1024, 4096))
-    many = 2 ** round(np.log2(np.clip(work / points, 32, max(32, paths))))
-    own = shifted_seed(seed, 2)
-    reference = begin(tracer, unseen_in_volume(scene, points, own), followed, own, many)
-    return errors(look_up(grids, reference.queries), reference) if reference.mean > 0 else None
+    share = work * (bounces + 1) / (20 * (followed + 1))
+    points = int(np.clip(share / max(paths, 1), 1024, 4096))
+    many = 2 ** round(np.log2(np.clip(share / points, 32, max(32, paths))))
+    return begin(tracer, unseen(points, seed), followed, seed, many)
 
 
 def remedies(scene: Scene, backend: Backend, specs: Sequence[GridSpec], bounces: int, seed: int) -> dict[str, float]:

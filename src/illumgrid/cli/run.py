@@ -204,6 +204,15 @@ def run(
         str | None,
         typer.Option("--scene", help="What is around a volume: studio, sky, floor, box (and lamp). [default: studio]"),
     ] = None,
+    texels: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            max=4096,
+            metavar="N",
+            help="Texels along the longest edge of the walls. [default: those of the scene: one for three voxels]",
+        ),
+    ] = None,
     albedo: Annotated[
         tuple[float, float, float] | None,
         typer.Option(metavar="R G B", help="Share of light that the surface reflects. [default: a neutral grey]"),
@@ -248,6 +257,7 @@ def run(
     from illumgrid.chain import run as light_up
     from illumgrid.field.diagnosis import diagnose
     from illumgrid.field.lattice import nodes_over
+    from illumgrid.field.scene import with_texels
     from illumgrid.io import store
 
     with reported_warnings(ignore) as sentences:
@@ -263,6 +273,7 @@ def run(
         folder = output or Path(f"{asked.name}-light")
         store.claim(folder, overwrite)
         scene = _in_harmonics(asked.make(smooth or 0.0), lights, degree)
+        scene = with_texels(scene, texels) if texels else scene
         for field in scene.fields:
             shape = " x ".join(map(str, field.volume.shape))
             say(f"{field.name}: {shape} voxels, isovalues {shown_range(field.range)}")
@@ -281,7 +292,7 @@ def run(
         light = replace(light, recipe={**light.recipe, **about, "warnings": sentences})
         _save(light, folder, not no_preview, overwrite)
         light = _judged(light, stages, folder)
-        about = {key: light.recipe[key] for key in ("reached", "reached_uncertain")}
+        about = {key: light.recipe[key] for key in ("reached", "reached_uncertain", "reached_on_walls")}
         store.amend(folder, {**about, "warnings": sentences})
     _report(light, folder, picture=not no_preview)
 
@@ -371,5 +382,7 @@ def _report(light: "Illumination", folder: Path, picture: bool) -> None:
     say(f"{work} in {sum(recipe['seconds'].values()):.1f} s{noise}{omitted_light(recipe)}")
     if reached:
         predicted = f"; predicted: {plan['error']:.2%}" if plan else ""
-        say(f"error reached: {reached:.2%} +- {recipe['reached_uncertain']:.2%} of the mean light{predicted}")
+        on_walls = recipe["reached_on_walls"]
+        walls = f", on walls {on_walls:.2%} of theirs" if on_walls is not None else ""
+        say(f"error reached: {reached:.2%} +- {recipe['reached_uncertain']:.2%} of the mean light{walls}{predicted}")
     say(f"wrote {folder}" + (f"; look at {folder / 'preview.png'}" if picture else ""))

@@ -1,6 +1,6 @@
 """What is lit: fields, quads and their materials, and the background light."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -291,7 +291,8 @@ class Scene:
         scene = cls.sky(volume, albedo, range, inside, name)
         right, front, up, centre, half = _upright_box(volume)
         reach = 1.5 * half[:2].max()
-        ground = _wall("floor", centre - half[2] * up, reach * right, -reach * front, np.full(3, 0.75), (32, 32))
+        ground = _wall("floor", centre - half[2] * up, reach * right, -reach * front, np.full(3, 0.75))
+        ground = _square_texels(ground, 2 * _texel(volume, 2 * reach) / (2 * reach))
         return cls(scene.fields, (ground,), scene.background)
 
     @classmethod
@@ -382,9 +383,42 @@ def _upright_box(volume: Volume) -> tuple[Floats, Floats, Floats, Floats, Floats
     return axes[:, 0], axes[:, 1], axes[:, 2], index_to_world(volume, last / 2), half
 
 
-def _wall(name: str, centre: Floats, u: Floats, v: Floats, albedo: Floats, texels: tuple[int, int]) -> Quad:
+def _wall(name: str, centre: Floats, u: Floats, v: Floats, albedo: Floats) -> Quad:
     """Parallelogram with half edges u and v around its centre; its front is u × v."""
-    return Quad(name, centre - u - v, 2 * u, 2 * v, Material(albedo), texels)
+    return Quad(name, centre - u - v, 2 * u, 2 * v, Material(albedo))
+
+
+def _square_texels(quad: Quad, per_length: float) -> Quad:
+    """The quad with texels as square as they can be, so many per world unit."""
+    edges = (float(np.linalg.norm(edge)) for edge in (quad.edge_u, quad.edge_v))
+    nu, nv = (max(1, round(per_length * edge)) for edge in edges)
+    return replace(quad, texels=(nu, nv))
+
+
+def _texel(volume: Volume, longest: float) -> int:
+    """Texels along a wall of this length beside a volume: one for about three voxels, at least 6 and at most 48."""
+    side = float((np.array(volume.shape) * volume.spacing).max())
+    return int(np.clip(round(longest / side * max(volume.shape) / 3.3), 6, 48))
+
+
+def with_texels(scene: Scene, longest: int) -> Scene:
+    """The scene with square texels, `longest` of them along the longest edge of all walls; a lamp keeps its own.
+
+    Raises
+    ------
+    BadInput
+        If no wall reflects light: the light that falls on it would not be shown.
+    """
+    walls = [quad for quad in scene.quads if quad.material.albedo.any()]
+    if not walls:
+        raise BadInput(f"{longest} texels were asked for in a scene without walls; expected a floor, a box or quads")
+    edge = max(float(np.linalg.norm(edge)) for quad in walls for edge in (quad.edge_u, quad.edge_v))
+    return replace(
+        scene,
+        quads=tuple(
+            _square_texels(quad, longest / edge) if quad.material.albedo.any() else quad for quad in scene.quads
+        ),
+    )
 
 
 def box_around(volume: Volume, margin: float = 0.25) -> tuple[Quad, ...]:
@@ -396,12 +430,14 @@ def box_around(volume: Volume, margin: float = 0.25) -> tuple[Quad, ...]:
     lamp = Quad(
         "lamp", centre - 0.98 * u - 0.4 * r + 0.4 * f, 0.8 * r, -0.8 * f, Material(np.zeros(3), np.full(3, 8.0)), (1, 1)
     )
-    return (
-        _wall("floor", centre - u, r, -f, white, (12, 12)),
-        _wall("ceiling", centre + u, r, f, white, (6, 6)),
-        _wall("left", centre - r, f, -u, red, (6, 6)),
-        _wall("right", centre + r, f, u, green, (6, 6)),
-        _wall("back", centre - f, r, u, white, (6, 6)),
-        _wall("front", centre + f, r, -u, white, (6, 6)),
-        lamp,
+    walls = (
+        _wall("floor", centre - u, r, -f, white),
+        _wall("ceiling", centre + u, r, f, white),
+        _wall("left", centre - r, f, -u, red),
+        _wall("right", centre + r, f, u, green),
+        _wall("back", centre - f, r, u, white),
+        _wall("front", centre + f, r, -u, white),
     )
+    longest = 2 * float(half.max())
+    fine = _texel(volume, longest) / longest  # twice that on the floor, where the lamp is near and shadows are sharp
+    return (*(_square_texels(wall, 2 * fine if wall.name == "floor" else fine) for wall in walls), lamp)

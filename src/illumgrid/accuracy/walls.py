@@ -1,0 +1,56 @@
+"""The error of the light of walls: at places on them and in the sweep at which no texel and no row of the table is."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from illumgrid.accuracy.points import other_paths
+from illumgrid.field.scene import Scene
+from illumgrid.field.volume import Floats
+from illumgrid.grid import WallTexture
+from illumgrid.transport.samples import Queries
+
+
+def unseen_on_walls(scene: Scene, points: int, seed: int) -> Queries:
+    """Points uniform by area on the fronts of quads that reflect, each at a setting of the sweep of its own."""
+    shown = [number for number, quad in enumerate(scene.quads) if quad.material.albedo.any()]
+    if not shown:
+        return Queries.at(scene, np.zeros((0, 3)))
+    random = np.random.default_rng((other_paths(seed), 3))
+    area = np.array([scene.quads[number].area for number in shown])
+    chosen = np.sort(np.array(shown)[random.choice(len(shown), points, p=area / area.sum())])
+    u, v, t = random.random((3, points))
+    corner, along, across, normal = (
+        np.array([getattr(quad, name) for quad in scene.quads])[chosen]
+        for name in ("corner", "edge_u", "edge_v", "normal")
+    )
+    target = (chosen + len(scene.fields)).astype(np.int32)
+    return Queries(
+        id=np.arange(points, dtype=np.uint64) | target.astype(np.uint64) << np.uint64(40),
+        point=corner + u[:, None] * along + v[:, None] * across,
+        normal=normal,
+        level=scene.levels(t),
+        target=target,
+    )
+
+
+def place_on_walls(scene: Scene, asked: Queries) -> tuple[NDArray[np.intp], Floats, Floats, Floats]:
+    """For queries on walls (n,): the number of the quad, u and v along its edges, and t in the sweep."""
+    number = asked.target.astype(int) - len(scene.fields)
+    uv = np.zeros((len(asked), 2))
+    for k in np.unique(number):
+        quad, own = scene.quads[k], number == k
+        edges = np.stack([quad.edge_u, quad.edge_v], axis=1)
+        uv[own] = np.linalg.lstsq(edges, (asked.point[own] - quad.corner).T, rcond=None)[0].T
+    return number, uv[:, 0], uv[:, 1], scene.fields[0].place(asked.level[:, 0])
+
+
+def look_up_walls(scene: Scene, walls: Sequence[WallTexture], asked: Queries) -> Floats:
+    """Light (n, 3) that the textures hold at queries on walls."""
+    number, u, v, t = place_on_walls(scene, asked)
+    light = np.zeros((len(asked), 3))
+    for k in np.unique(number):
+        own = number == k
+        light[own] = walls[k].lookup(u[own], v[own], t[own])
+    return light
