@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from illumgrid import run
-from illumgrid.accuracy.choose import Goal, Plan, choose, planned, sizes
+from illumgrid.accuracy.choose import Goal, Plan, choose, outlook, planned, sizes
 from illumgrid.accuracy.cost import Pace
 from illumgrid.accuracy.judge import judge
 from illumgrid.accuracy.parts import Parts, parts_of
@@ -236,6 +236,23 @@ def test_what_cannot_be_had_is_said():
     assert not choose([measured(40, 0.005)], PACE, Goal(seconds=1e-3)).met
     fixed = choose([measured(20, 0.02)], PACE, Goal(0.03, paths=7))
     assert fixed.paths == 7 and not fixed.met
+
+
+def test_a_plan_that_is_crude_late_or_out_of_reach_is_announced():
+    tried = [measured(20, 0.02), measured(40, 0.005)]
+
+    def said(goal, tried=tried):
+        return outlook(tried, PACE, goal, choose(tried, PACE, goal))
+
+    easy = choose(tried, PACE, Goal(0.05)).seconds
+    assert said(Goal(0.05)) == "" and said(Goal(seconds=10 * easy)) == ""
+    short = said(Goal(seconds=1e-3))
+    assert "0.001 seconds are too short" in short and "10% takes about" in short
+    assert "out of reach" in said(Goal(1e-4))
+    times = 100 / choose(tried, PACE, Goal(0.021)).seconds
+    slow = Pace(times * PACE.node, times * PACE.path)
+    late = outlook(tried, slow, Goal(0.021), choose(tried, slow, Goal(0.021)))
+    assert "2.1% is predicted to take" in late and "--seconds 60 reaches" in late
 
 
 def test_walls_take_their_time():

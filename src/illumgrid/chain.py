@@ -125,6 +125,8 @@ def run(
             scene, tracer, levels, error=error, seconds=seconds, grid=grid, paths=paths, bounces=bounces, seed=seed
         )
         progress("pilot", 1, 1)
+        if plan.outlook:
+            tell("plan", plan.outlook, stacklevel=2)
         grid, bounces = plan.grid, plan.bounces
         walked = [range(plan.paths)] if seconds is None or paths is not None else rounds(plan, begun + seconds)
     if not _shines(scene):

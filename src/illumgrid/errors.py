@@ -34,6 +34,7 @@ WARNINGS = {
     "empty": "isovalues of the range that have no surface",
     "anisotropy": "voxels much longer along one axis than along another",
     "range": "a range that goes beyond the data",
+    "plan": "a time that is too short for the scene, or an error that is out of reach or takes minutes",
     "dark": "a scene without any light",
     "error": "a finished run whose error could not be measured",
     "grid": "light that the grid cannot hold between its nodes, whatever the paths",

@@ -18,6 +18,7 @@ JUDGED = 0.95  # of the asked seconds: the rest is for the judgement at the end
 TRIAL_PATHS = 16  # from each node, with which grids are tried
 REFERENCE_COST = 4  # of its paths, over others: they are walked twice, with more bounces and with fewer
 SOON = 5.0  # seconds that a look at more points may take even before a shorter run
+CRUDE, LONG = 0.1, 60.0  # relative error, and seconds, beyond which a plan is announced with an alternative
 MOST_NODES = 40_000_000  # a grid of about 2 GB with all that belongs to it
 
 
@@ -60,6 +61,7 @@ class Plan:
     pilot: float  # seconds that the probe took
     met: bool  # whether the asked error, or time, is predicted to be kept
     why: tuple[str, ...]  # sentences for the user
+    outlook: str = ""  # said before the light is computed: a time that is too short, an error that takes long
 
 
 def sizes(scene: Scene) -> list[int]:
@@ -198,7 +200,34 @@ def planned(
     return Plan(
         choice.measured.grid, choice.paths, look.bounces, choice.error, choice.seconds,
         choice.measured.nodes * pace.node, time.perf_counter() - begun, choice.met, why,
+        outlook(look.tried, pace, replace(goal, seconds=np.inf if seconds is None else seconds), choice),
     )  # fmt: skip
+
+
+def outlook(tried: Sequence[Measured], pace: Pace, goal: Goal, choice: Choice) -> str:
+    """What a user should know before the light is computed; empty if the run is short and as good as asked."""
+    if goal.error is None:
+        if choice.met and choice.error <= CRUDE:
+            return ""
+        better = choose(tried, pace, replace(goal, error=CRUDE, seconds=np.inf))
+        cost = f"; {CRUDE:.0%} takes about {_time(better.seconds)}" if better.met else ""
+        return (
+            f"{goal.seconds:g} seconds are too short for this scene: an error of about {choice.error:.0%} is predicted"
+            f"{cost}; --error chooses the time"
+        )
+    if not choice.met:
+        return (
+            f"an error of {goal.error:.1%} is out of reach: {choice.error:.1%} is predicted, in {_time(choice.seconds)}"
+        )
+    if choice.seconds <= LONG:
+        return ""
+    soon = choose(tried, pace, replace(goal, error=None, seconds=LONG))
+    least = f"; --seconds {LONG:g} reaches about {soon.error:.1%}" if soon.met else ""
+    return f"an error of {goal.error:.1%} is predicted to take {_time(choice.seconds)}{least}"
+
+
+def _time(seconds: float) -> str:
+    return f"{seconds:.0f} seconds" if seconds < 90 else f"{seconds / 60:.0f} minutes"
 
 
 def reasons(scene: Scene, choice: Choice, bounces: int, left_out: float) -> tuple[str, ...]:
