@@ -210,3 +210,92 @@ def test_lights_that_cannot_be_are_refused():
     ):
         with pytest.raises(BadInput, match=words):
             bad()
+
+
+# Scene files.
+
+
+@pytest.fixture
+def scene_file(tmp_path):
+    np.save(tmp_path / "v.npy", np.asarray(unit(waves()).values))
+
+    def write(lights):
+        path = tmp_path / "s.toml"
+        path.write_text('[[field]]\nname = "v"\nvolume = "v.npy"\nrange = [0.3, 0.7]\n' + lights)
+        return path
+
+    return write
+
+
+def exr(path, image):
+    import OpenEXR
+
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    OpenEXR.File(header, {"RGB": np.ascontiguousarray(image, np.float32)}).write(str(path))
+
+
+def hdr(path, image, lengths):
+    """Radiance's RGBE of small whole numbers, with run lengths or without."""
+    rows, columns, _ = image.shape
+    rgbe = np.concatenate([image, np.full((rows, columns, 1), 136)], axis=2).astype(np.uint8)
+    body = b""
+    for row in rgbe:
+        if not lengths:
+            body += row.tobytes()
+            continue
+        body += bytes([2, 2, columns >> 8, columns & 255])
+        for channel in row.T:
+            even = (channel[:3] == channel[0]).all()
+            body += bytes([128 + 3, channel[0]]) if even else bytes([3]) + channel[:3].tobytes()
+            body += bytes([columns - 3]) + channel[3:].tobytes()
+    path.write_bytes(b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y %d +X %d\n" % (rows, columns) + body)
+
+
+def test_lights_of_a_scene_file(scene_file, tmp_path):
+    image = np.random.default_rng(0).integers(1, 200, (5, 10, 3)).astype(np.float32)
+    image[:, :3] = image[:, :1]
+    exr(tmp_path / "sky.exr", image)
+    hdr(tmp_path / "flat.hdr", image, False)
+    hdr(tmp_path / "runs.hdr", image, True)
+    path = scene_file(
+        '[[light]]\nname = "dome"\nradiance = [1, 2, 3]\n[[light]]\nname = "g"\nnadir = [0, 0, 0]\nzenith = [1, 1, 1]\n'
+        '[[light]]\nname = "sun"\ndirection = [0, 0, 2]\nangle = 0.27\nirradiance = [3, 3, 3]\n'
+        + "".join(f'[[light]]\nname = "{name}"\nimage = "{name}"\n' for name in ("sky.exr", "flat.hdr", "runs.hdr"))
+        + '[[quad]]\nname = "q"\ncorner = [0, 0, 9]\nedge_u = [1, 0, 0]\nedge_v = [0, 1, 0]\nemission = [1, 1, 1]\n'
+        'light = "sun"\n'
+    )
+    scene = ig.read_scene(path)
+    dome, gradient, sun, *images = scene.lights
+    assert dome.radiance.tolist() == [1, 2, 3] and gradient.radiance.tolist() == [[0, 0, 0], [1, 1, 1]]
+    assert sun.direction.tolist() == [0, 0, 1] and sun.angle == 0.27 and sun.irradiance.tolist() == [3, 3, 3]
+    for picture in images:
+        np.testing.assert_array_equal(picture.radiance, image)
+    assert [layer.name for layer in layers_of(scene)] == ["dome", "g", "sun", "sky.exr", "flat.hdr", "runs.hdr"]
+
+
+@pytest.mark.parametrize(
+    "table, words",
+    [
+        ("[[ligth]]", "did you mean 'light'"),
+        ('[[light]]\nname = "a"\nradience = [1, 1, 1]', "did you mean 'radiance'"),
+        ('[[light]]\nname = "a"\nzenith = [1, 1, 1]', "zenith came; expected radiance, or nadir with zenith, or image"),
+        ('[[light]]\nname = "a"\nimage = "none.exr"', "image: there is no file"),
+        ('[[light]]\nname = "a"\nimage = "v.npy"', "ends in .npy"),
+        ('[[light]]\nname = "a"\ndirection = [0, 0, 1]\nangle = 95\nirradiance = [1, 1, 1]', "angle of light 'a'"),
+    ],
+)
+def test_bad_lights_of_a_scene_file_are_told(scene_file, table, words):
+    with pytest.raises(BadInput, match=words):
+        ig.read_scene(scene_file(table + "\n"))
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"#?RADIANCE\n\n-Y 4 +X 8\n\x02\x02", b"#?RADIANCE\n\n-Y 99999 +X 99999\n", b"#?RGBE\n+X 3 -Y 4\n"]
+)
+def test_damaged_images_of_a_sky_are_refused(content, tmp_path):
+    from illumgrid.io.readers.sky import read_image
+
+    for name in ("a.hdr", "a.exr"):
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(BadInput, match=name):
+            read_image(tmp_path / name)

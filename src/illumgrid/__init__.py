@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from illumgrid.errors import BadInput, IllumgridWarning
     from illumgrid.field.boundaries import suggest_range
     from illumgrid.field.levelset import isosurface
+    from illumgrid.field.lights import Distant, Sky
     from illumgrid.field.scene import Field, Levels, Material, Quad, Scene
     from illumgrid.field.volume import Volume
     from illumgrid.grid import GridSpec, IlluminationGrid, WallTexture
@@ -29,6 +30,7 @@ if not _threads.isdecimal() or int(_threads) < 1:
 
 __all__ = [
     "BadInput",
+    "Distant",
     "Field",
     "GridSpec",
     "IllumgridWarning",
@@ -40,6 +42,7 @@ __all__ = [
     "Queries",
     "Samples",
     "Scene",
+    "Sky",
     "Volume",
     "WallTexture",
     "backend",
@@ -58,6 +61,7 @@ _HOMES = {
     "errors": ("BadInput", "IllumgridWarning"),
     "field.levelset": ("isosurface",),
     "field.boundaries": ("suggest_range",),
+    "field.lights": ("Distant", "Sky"),
     "field.scene": ("Field", "Levels", "Material", "Quad", "Scene"),
     "field.volume": ("Volume",),
     "grid": ("GridSpec", "IlluminationGrid", "WallTexture"),

@@ -8,7 +8,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from illumgrid.errors import BadInput
+from illumgrid.field.lights import Distant, Light, Sky
 from illumgrid.field.scene import Field, Material, Quad, Scene
 from illumgrid.field.signed import signed_pair, without_gaps
 from illumgrid.field.volume import Volume, finite, smooth
@@ -36,7 +39,9 @@ def read_scene(path: str | os.PathLike[str], *, smoothing: float = 0.0) -> Scene
         reads, relative to this file) and perhaps `albedo`, `emission`, `range`, `inside`, `falling`, `signed` (true:
         two fields, ``NAME-positive`` where h >= c and ``NAME-negative`` where h <= -c), and the options of
         `read_volume` (`spacing`, `channel`, `time`, `array`, `label`, `crop`, `downsample`); ``[[quad]]`` with `name`,
-        `corner`, `edge_u`, `edge_v` and perhaps `albedo`, `emission`, `texels`; ``[background]`` with `radiance`. What
+        `corner`, `edge_u`, `edge_v` and perhaps `albedo`, `emission`, `texels`, `light`; ``[[light]]`` with `name` and
+        either `radiance`, or `nadir` and `zenith`, or `image`, or `direction`, `angle` and `irradiance`, see `Sky` and
+        `Distant`; ``[background]`` with `radiance`. What
         is left out has the default of `Field`, `Material`, `Quad` or `Scene`.
     smoothing : float, optional
         Standard deviation, in voxels, of a Gaussian that blurs every field before anything else.
@@ -180,8 +185,29 @@ _QUAD: Mapping[str, Take] = {
     "edge_v": _VECTOR,
     **_MATERIAL,
     "texels": _numbers(2, "two whole numbers in brackets (along edge_u and edge_v)", int, 4096),
+    "light": _text,
 }
 _BACKGROUND: Mapping[str, Take] = {"radiance": _COLOUR}
+
+
+def _degrees(key: str, value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise BadInput(f"{key} is {_shown(value)}; expected degrees, half of the light's angular size")
+    return float(value)
+
+
+_LIGHT: Mapping[str, Take] = {
+    "name": _text,
+    "radiance": _COLOUR,
+    "nadir": _COLOUR,
+    "zenith": _COLOUR,
+    "image": _text,
+    "direction": _VECTOR,
+    "angle": _degrees,
+    "irradiance": _COLOUR,
+}
+_KINDS_OF_LIGHT = (("radiance",), ("nadir", "zenith"), ("image",), ("direction", "angle", "irradiance"))
+"""What a table [[light]] has besides its name: a constant sky, a gradient, an image, a disc of the sky."""
 
 
 def _unknown(kind: str, name: str, known: Mapping[str, Any]) -> BadInput:
@@ -218,8 +244,8 @@ def _listed(tables: Table, kind: str, keys: Mapping[str, Take], required: tuple[
 
 def _scene(tables: Table, folder: Path, smoothing: float) -> Scene:
     for name in tables:
-        if name not in ("field", "quad", "background"):
-            raise _unknown("table", name, {"field": 0, "quad": 0, "background": 0})
+        if name not in ("field", "quad", "light", "background"):
+            raise _unknown("table", name, {"field": 0, "quad": 0, "background": 0, "light": 0})
     fields = _listed(tables, "field", _FIELD, ("name", "volume"))
     quads = _listed(tables, "quad", _QUAD, ("name", "corner", "edge_u", "edge_v"))
     background = tables.get("background", {})
@@ -240,11 +266,31 @@ def _scene(tables: Table, folder: Path, smoothing: float) -> Scene:
     for place, table in quads:
         with _place(place):
             walls.append(Quad(**table))
+    lights = []
+    for place, table in _listed(tables, "light", _LIGHT, ("name",)):
+        with _place(place):
+            lights.append(_light(table, folder))
     volumes: dict[str, Volume] = {}  # two fields may be two ranges of one file
     for place, table in fields:  # last, because reading takes longest
         with _place(place):
             solids.extend(_fields(table, _volume(table, folder, smoothing, volumes)))
-    return Scene(tuple(solids), tuple(walls), radiance)
+    return Scene(tuple(solids), tuple(walls), radiance, tuple(lights))
+
+
+def _light(table: Table, folder: Path) -> Light:
+    """The light of a checked table."""
+    own = _without(table, {"name": 0, "material": 0})
+    if set(own) not in map(set, _KINDS_OF_LIGHT):
+        kinds = ", or ".join(" with ".join(kind) for kind in _KINDS_OF_LIGHT)
+        raise BadInput(f"{' with '.join(own) or 'nothing but a name'} came; expected {kinds}")
+    if "direction" in own:
+        return Distant(table["name"], **own)
+    if "image" in own:
+        from illumgrid.io.readers.sky import read_image
+
+        with _place("image"):
+            return Sky(table["name"], np.asarray(read_image(folder / own["image"]), float))
+    return Sky(table["name"], np.array(own["radiance"] if "radiance" in own else (own["nadir"], own["zenith"])))
 
 
 def _fields(table: Table, volume: Volume) -> tuple[Field, ...]:
