@@ -1,14 +1,16 @@
-"""Kills ``illumgrid run`` at random moments: ``python benchmarks/kills.py [--kills N] [--seed N]``.
+"""Stops ``illumgrid run`` at random moments: ``python benchmarks/kills.py [--kills N] [--seed N]``.
 
-Each kill starts a run of a tiny volume in its own process and ends it by SIGKILL, at a moment drawn uniformly from the
-run's duration. Half of the runs write to a new DIR, half, with ``--overwrite``, to one that holds a finished run. Most
-of a run is imports and light, which write nothing, so every other moment is drawn from the time of writing: it begins
-when the hidden folder ``.DIR-...`` beside DIR appears, and lasts as long as in an uninterrupted run.
+Each starts a run of a tiny volume in its own process and ends it by SIGKILL, SIGTERM or SIGHUP in turn, at a moment
+drawn uniformly from the run's duration. Half of the runs write to a new DIR, half, with ``--overwrite``, to one that
+holds a finished run. Most of a run is imports and light, which write nothing, so every other moment is drawn from the
+time of writing: it begins when the result appears in a hidden folder ``.DIR-...`` beside DIR, and lasts as long as in
+an uninterrupted run.
 
 Afterwards DIR must be absent or complete (it is read back and compared with the result of its seed; with
-``--overwrite`` the old result counts as complete), only hidden folders may lie beside it, and the next run into the
-same DIR must work. Between the two renames of ``--overwrite``, DIR is absent and both results are complete in the
-hidden folder; the summary counts this case. The exit code is 1 if anything else is found.
+``--overwrite`` the old result counts as complete), only after SIGKILL may hidden folders lie beside it, and the next
+run into the same DIR must work and remove them. Between the two renames of ``--overwrite``, DIR is absent and both
+results are complete in the hidden folder, from which the next run puts the old one back; the summary counts this
+case. The exit code is 1 if anything else is found.
 """
 
 import argparse
@@ -31,9 +33,9 @@ OPTIONS = ("--range", "0.3", "0.9", "--grid", "24", "--paths", "4", "--threads",
 STEP = 0.0002  # seconds between polls
 
 
-def start(folder, seed):
+def start(folder, seed, overwrite=False):
     command = [sys.executable, "-m", "illumgrid", "run", "v.npy", *OPTIONS, "-o", "out", "--seed", str(seed)]
-    if (folder / "out").exists():
+    if overwrite or (folder / "out").exists():
         command.append("--overwrite")
     return subprocess.Popen(command, cwd=folder, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
 
@@ -44,7 +46,7 @@ def hidden(folder, prefix=".out-"):
 
 def writing(folder, process):
     """Wait until the process has begun to write, or has ended."""
-    while not hidden(folder) and process.poll() is None:
+    while not any((p / "new").is_dir() for p in hidden(folder)) and process.poll() is None:
         time.sleep(STEP)
 
 
@@ -76,7 +78,7 @@ def whole(out, lights):
     return found[0]
 
 
-def kill(folder, finished, lights, chance, durations, late):
+def kill(folder, finished, lights, chance, durations, late, signals):
     """Kill one run and classify what it left."""
     out = folder / "out"
     if finished:
@@ -88,7 +90,7 @@ def kill(folder, finished, lights, chance, durations, late):
         time.sleep(chance.uniform(0, during))
     else:
         time.sleep(chance.uniform(0, before + during + after))
-    process.send_signal(signal.SIGKILL)
+    process.send_signal(signals)
     ended = process.wait()
     seed, left = whole(out, lights), hidden(folder, ".")
     unexpected = {p.name for p in folder.iterdir()} - {"v.npy", "out", *(p.name for p in left)}
@@ -105,8 +107,11 @@ def kill(folder, finished, lights, chance, durations, late):
         assert seed in ((OLD, NEW) if finished else (None, NEW))
     if left:
         found += ", a hidden folder left beside it"
-    again = start(folder, NEW)
+    if signals != signal.SIGKILL:
+        assert not left, left
+    again = start(folder, NEW, overwrite=finished is not None)  # which puts back what was moved aside
     assert again.wait() == 0 and whole(out, lights) == NEW
+    assert not hidden(folder, "."), "a folder of a dead process"
     return found
 
 
@@ -132,13 +137,15 @@ def main():
         print(f"a run takes {before:.2f} s before, {during:.3f} s during and {after:.2f} s after writing", flush=True)
         for number in range(asked.kills):
             over, late = number % 2 == 1, number // 2 % 2 == 1
+            signals = (signal.SIGKILL, signal.SIGTERM, signal.SIGHUP)[number % 3]
             folder = Path(work) / str(number)
             folder.mkdir()
             shutil.copy(place / "v.npy", folder)
             try:
-                found = kill(folder, place / "kept" if over else None, lights, chance, times, late)
+                found = kill(folder, place / "kept" if over else None, lights, chance, times, late, signals)
             except (AssertionError, ig.BadInput) as trouble:
                 found, wrong = f"WRONG: {trouble}", wrong + 1
+            found = f"{signals.name}: {found}"
             tally[("with --overwrite: " if over else "to a new DIR: ") + found] += 1
             shutil.rmtree(folder)
             if number % 10 == 9:

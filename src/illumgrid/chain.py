@@ -20,7 +20,7 @@ from illumgrid.errors import BadInput, tell
 from illumgrid.field.lattice import specs_over
 from illumgrid.field.layers import layers_of
 from illumgrid.field.scene import Scene, level_table
-from illumgrid.io import store
+from illumgrid.io import needs, store
 from illumgrid.light import Illumination
 from illumgrid.stages import Backend, Interpolator, Sampler
 from illumgrid.transport.stages import capabilities
@@ -132,6 +132,7 @@ def run(
     if not _shines(scene):
         tell("dark", "no background, lamp or surface of this scene emits light: all of it will be 0", stacklevel=2)
     specs = specs_over(scene, grid)
+    needs.check_run(scene, specs, levels)
     if bounces is None:
         bounces, left_out = enough_bounces(scene, tracer, seed)
     else:

@@ -1,6 +1,7 @@
 """The command line: one file per command; only here does the package print."""
 
 import io
+import re
 import signal
 import sys
 from collections.abc import Callable
@@ -67,7 +68,7 @@ def in_options(sentence: str) -> str:
     """A sentence of the library, which speaks of arguments, in the options of the command line."""
     for argument, option in {"overwrite=True": "--overwrite", "another folder": "another folder with -o"}.items():
         sentence = sentence.replace(argument, option)
-    return sentence
+    return re.sub(r"\bgrid=(\d+)", r"--grid \1", sentence)
 
 
 def guarded(command: Callable[[], Any]) -> int:

@@ -85,12 +85,14 @@ def _describe_volume(source: str, limits: tuple[float, float] | None, inside: "S
     from illumgrid.field.scene import Field
     from illumgrid.field.signed import has_both_signs, suggest_magnitudes
     from illumgrid.field.volume import finite
+    from illumgrid.io import needs
     from illumgrid.io.readers import read_volume, volume_name
 
     labels = labels_of(reading.pop("label", None))
     if len(labels) > 1:
         raise BadInput(f"--label holds {len(labels)} labels; expected one for info; ask for one after another")
     volume = finite(read_volume(source, **reading, label=labels[0] if labels else None), inside)
+    needs.check("info", needs.TO_DESCRIBE * volume.values.size, "cut or --downsample the volume")
     _describe_lattice(volume_name(source), volume)
     low, high, why = suggest_range(volume, inside)
     if labels:

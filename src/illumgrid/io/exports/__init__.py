@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from illumgrid.errors import BadInput, shown
-from illumgrid.io import disk
+from illumgrid.io import disk, needs
 from illumgrid.io.exports import arrays, surface, vti
 
 if TYPE_CHECKING:
@@ -104,6 +104,9 @@ def write(
         level = shown(lit.isovalue, light.scene.fields[number].range, 6)
         return f"isosurface {level} of {lit.field!r}, {count} triangles, exposure {lit.exposure:.4g}"
     names = (array or "irradiance",) if ending == ".nrrd" else arrays.NAMES
+    lattice = light.grids[number].spec if on != "field" else light.scene.fields[number].volume
+    todo = "leave out --on field, or write a .nrrd, which holds one array"
+    needs.check("the file", needs.TO_EXPORT * math.prod(lattice.shape) * len(names) / len(arrays.NAMES), todo)
     points = arrays.points_of(light, number, on or "grid", names, progress)
     with disk.fresh_file(path) as fresh:
         LATTICES[ending](fresh, points, progress)

@@ -1,0 +1,58 @@
+"""The memory that a command is going to take, refused before any of it is taken.
+
+Bytes are peaks measured by `benchmarks/memory.py`, above what is held when the question is asked.
+"""
+
+from collections.abc import Sequence
+from math import prod
+from typing import TYPE_CHECKING
+
+from illumgrid.errors import BadInput
+from illumgrid.field.lattice import GridSpec
+from illumgrid.grid import channels_of
+from illumgrid.io.readers.limits import free_memory, gigabytes
+
+if TYPE_CHECKING:
+    from illumgrid.field.scene import Field, Levels, Scene
+
+TO_DESCRIBE = 21
+"""Bytes a voxel for the histogram, plateaus and warnings of a volume that is read."""
+TO_LIGHT = 44
+"""Bytes a voxel for diagnosis, preparation and writing of a field."""
+TO_EXPORT = 75
+"""Bytes a point for all arrays in one file."""
+_QUERY, _CHANNEL = 300, 20
+"""Bytes a query, and for each channel of its answer."""
+_SOME = 50_000
+"""Voxels that are looked at to learn what share of the nodes is asked about."""
+
+
+def check(what: str, need: float, todo: str) -> None:
+    """Refuse what needs more bytes of memory than are free."""
+    if need > (free := free_memory()):
+        raise BadInput(f"{what} needs {gigabytes(int(need))} of memory, {gigabytes(free)} are free; {todo}")
+
+
+def check_run(scene: "Scene", specs: Sequence[GridSpec], levels: "Levels") -> None:
+    """Refuse a run whose nodes, walls and fields do not fit, and say which grid would."""
+    channels = len(channels_of(scene))
+    each = _QUERY + _CHANNEL * channels
+    fixed = sum(TO_LIGHT * prod(field.volume.shape) for field in scene.fields)
+    fixed += each * len(levels.table) * sum(prod(quad.texels) for quad in scene.quads)
+    nodes = sum(
+        prod(spec.shape) * (8 * (channels + 1) + each * _share(field)) for spec, field in zip(specs, scene.fields)
+    )
+    longest, room = max(max(spec.shape) for spec in specs), 0.8 * free_memory() - fixed
+    fits = int(longest * (max(room, 0.0) / nodes) ** (1 / 3))
+    todo = "cut or downsample the volume"
+    if fits >= 8:
+        todo = f"grid={fits} would need {gigabytes(int(fixed + nodes * (fits / longest) ** 3))}"
+    check("the run", fixed + nodes, todo)
+
+
+def _share(field: "Field") -> float:
+    """Share of the nodes through which isosurfaces of the range pass, about."""
+    values = field.volume.values.ravel(order="K")
+    some = values[:: max(1, len(values) // _SOME)]
+    low, high = sorted(field.stored_range)
+    return float(((some >= low) & (some <= high)).mean())
