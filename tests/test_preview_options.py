@@ -10,10 +10,12 @@ import illumgrid as ig
 from illumgrid.errors import BadInput
 from illumgrid.field.scene import Scene
 from illumgrid.field.upright import axes_of, up_of
+from illumgrid.field.volume import Volume
 from illumgrid.show import UPS, fit_camera, png, render, strip
 from illumgrid.show.camera import camera_of, camera_text
 from illumgrid.show.captions import round_down, scale_bar
 from illumgrid.show.engines import gl
+from illumgrid.show.shade import Shown
 from illumgrid.tone import curve, decode_srgb, encode_srgb
 from shapes import DIRECTIONS, ball, lit, refused, sampled, sky
 from test_preview_engines import cut_open
@@ -241,3 +243,15 @@ def test_the_window_turns_about_what_it_shows(monkeypatch):
     offset = np.asarray(Plotter.camera.focal_point) - centre
     seen = fit_camera(scene, np.array([0.6]), 1.0)
     assert abs(offset @ seen.forward) < 0.1  # at the depth of the middle of the ball, not of its volume's first voxel
+
+
+def test_a_ground_under_the_open_sky_fades_and_walls_do_not():
+    def cover(scene):
+        light = ig.run(scene, grid=4, paths=2, bounces=0, isovalues=2, judge=False)
+        shown = Shown(light, scene.levels(0.5)[0], 0.5)
+        return shown.fade(0, np.array([0.5, 0.8, 1.0]), np.array([0.5, 0.5, 1.0]))
+
+    volume = Volume(np.indices((6, 6, 6)).sum(axis=0).astype(np.float32))
+    middle, outer, corner = cover(Scene.floor(volume, range=(4, 9)))
+    assert middle == 1 and 0 < outer < 1 and corner == 0
+    assert (cover(Scene.box(volume, range=(4, 9))) == 1).all()

@@ -159,7 +159,7 @@ def test_the_floor_touches_the_lowest_voxels_from_below(direction):
     scene = Scene.floor(of)
     (floor,) = scene.quads
     _, _, up = upright(direction)
-    assert floor.name == "floor" and scene.background.tolist() == [1, 1, 1]
+    assert floor.name == "floor" and [light.name for light in scene.lights] == ["key", "dome"]
     np.testing.assert_allclose(floor.normal, up, atol=1e-12)
     heights = (corners(of) - floor.corner) @ floor.normal
     assert heights.min() == pytest.approx(0, abs=1e-9) and heights.max() > 1

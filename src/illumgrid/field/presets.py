@@ -9,6 +9,8 @@ from illumgrid.field.volume import Floats
 
 ALBEDO = (0.65, 0.65, 0.65)
 """Neutral, and not so white that light between its folds washes out their shadows."""
+GROUND = 0.4
+"""Albedo of the floor: darker than the object, with room for shadows."""
 KEY, DOME = "key", "dome"
 AZIMUTH, ELEVATION, ANGLE = -20.0, 40.0, 25.0
 """Of the key, degrees: 50 to the left of the default view, which is 30 to the right of the front; half its size."""

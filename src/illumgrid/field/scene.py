@@ -287,13 +287,16 @@ class Scene:
         inside: Side = "above",
         name: str = "field",
     ) -> "Scene":
-        """One field on a white floor, under a white sky of radiance 1."""
+        """One field on a grey floor, in the light of a studio: see `Scene.studio`."""
+        from illumgrid.field.presets import GROUND, studio_lights
+
         scene = cls.sky(volume, albedo, range, inside, name)
         right, front, up, centre, half = _upright_box(volume)
-        reach = 1.5 * half[:2].max()
-        ground = _wall("floor", centre - half[2] * up, reach * right, -reach * front, np.full(3, 0.75))
+        reach = 2.2 * half[:2].max()
+        ground = _wall("floor", centre - half[2] * up, reach * right, -reach * front, np.full(3, GROUND))
         ground = _square_texels(ground, 2 * _texel(volume, 2 * reach) / (2 * reach))
-        return cls(scene.fields, (ground,), scene.background)
+        scene = cls(scene.fields, (ground,))
+        return replace(scene, lights=studio_lights(scene))
 
     @classmethod
     def box(

@@ -85,6 +85,14 @@ class Shown:
         shown = material.albedo / np.pi * self.light.walls[number].lookup(u, v, self.share) + material.emission
         return curve((shown * self.exposure).astype(np.float32))
 
+    def fade(self, number: int, u: Floats, v: Floats) -> Colors:
+        """Coverage (n,) of a quad at shares u, v (n,) of its edges: a ground under the open sky ends softly."""
+        if not self.scene.open or self.scene.quads[number].material.emission.any() or len(self.scene.quads) > 1:
+            return np.ones(len(u), np.float32)
+        rim = np.hypot(2 * u - 1, 2 * v - 1)  # a disc within the quad
+        share = np.clip((1.0 - rim) / 0.6, 0.0, 1.0)
+        return np.asarray(share * share * (3 - 2 * share), np.float32)
+
     def _lamplit(self, color: Floats, facing: Floats) -> Colors:
         return curve(np.float32(2.0**self.stops * WHITE) * _facing(color, facing))
 

@@ -24,11 +24,14 @@ class Colored:
     faces : (m, 3) int
     colors : (n, 3) float32
         Display-linear.
+    cover : (n,) float32, optional
+        Share that hides the background; by default all.
     """
 
     points: Floats
     faces: NDArray[np.integer]
     colors: Colors
+    cover: NDArray[np.float32] | None = None
 
 
 def seen(shown: Shown, eye: Floats) -> list[Colored]:
@@ -86,4 +89,4 @@ def wall(shown: Shown, number: int, eye: Floats) -> Colored:
     points = quad.corner + u[:, None] * quad.edge_u + v[:, None] * quad.edge_v
     toward = eye - points
     facing = toward @ quad.normal / np.linalg.norm(toward, axis=1)
-    return Colored(points, squares(nu, nv), shown.wall(number, u, v, facing))
+    return Colored(points, squares(nu, nv), shown.wall(number, u, v, facing), shown.fade(number, u, v))

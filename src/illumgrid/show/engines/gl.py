@@ -155,7 +155,10 @@ def _scene(pyrender: Any, parts: list[Colored], camera: Camera, background: Colo
     placed = [(part.points - camera.eye) @ axes for part in parts]
     near, far = _depths(placed)
     for part, points in zip(parts, placed):
-        color = np.concatenate([srgb_curve(part.colors), np.ones((len(points), 1), np.float32)], axis=1)
+        cover = np.ones((len(points), 1), np.float32) if part.cover is None else part.cover[:, None]
+        ground = background[:3] if background[3] else part.colors
+        color = srgb_curve(cover * part.colors + (1 - cover) * ground)
+        color = np.concatenate([color, cover + (1 - cover) * background[3]], axis=1)
         primitive = pyrender.Primitive(
             positions=(points / far).astype(np.float32), indices=part.faces.astype(np.uint32), color_0=color, mode=4,
             material=pyrender.MetallicRoughnessMaterial(alphaMode="OPAQUE", baseColorFactor=[1.0, 1.0, 1.0, 1.0]),

@@ -59,7 +59,9 @@ def draw(shown: Shown, camera: Camera, width: int, height: int, background: Colo
         for k in range(len(shown.scene.quads)):
             lit = np.flatnonzero(number == len(shown.scene.fields) + k)
             place = (eye + t[lit, None] * direction[lit] - fields.quad_corner[k]) @ fields.quad_duals[k].T
-            color[lit] = opaque(shown.wall(k, place[:, 0], place[:, 1], facing[lit]))
+            u, v = place.T
+            share = shown.fade(k, u, v)[:, None]
+            color[lit] = share * opaque(shown.wall(k, u, v, facing[lit])) + (1 - share) * background
         return color
 
     return traced(seen, camera, width, height)
