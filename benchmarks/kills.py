@@ -1,4 +1,4 @@
-"""Stops ``illumgrid run`` at random moments: ``python benchmarks/kills.py [--kills N] [--seed N]``.
+"""Stops ``illumgrid run`` at random moments: ``python benchmarks/kills.py [--kills N] [--seconds S] [--seed N]``.
 
 Each starts a run of a tiny volume in its own process and ends it by SIGKILL, SIGTERM or SIGHUP in turn, at a moment
 drawn uniformly from the run's duration. Half of the runs write to a new DIR, half, with ``--overwrite``, to one that
@@ -118,8 +118,10 @@ def kill(folder, finished, lights, chance, durations, late, signals):
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--kills", type=int, default=100)
+    parser.add_argument("--seconds", type=float, default=float("inf"), help="begin no kill after so long")
     parser.add_argument("--seed", type=int, default=0)
     asked = parser.parse_args()
+    until = time.monotonic() + asked.seconds
     chance, tally, wrong = random.Random(asked.seed), Counter(), 0
     with tempfile.TemporaryDirectory() as work:
         place = Path(work) / "first"
@@ -136,6 +138,8 @@ def main():
         before, during, after = times
         print(f"a run takes {before:.2f} s before, {during:.3f} s during and {after:.2f} s after writing", flush=True)
         for number in range(asked.kills):
+            if time.monotonic() > until:
+                break
             over, late = number % 2 == 1, number // 2 % 2 == 1
             signals = (signal.SIGKILL, signal.SIGTERM, signal.SIGHUP)[number % 3]
             folder = Path(work) / str(number)

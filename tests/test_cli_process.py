@@ -15,6 +15,7 @@ import illumgrid as ig
 from illumgrid import cli
 from illumgrid.cli import terminal
 from illumgrid.errors import BadInput
+from illumgrid.io import store
 from shapes import ball
 
 COMMAND = (sys.executable, "-m", "illumgrid")
@@ -140,3 +141,10 @@ def test_redirected_output_reports_progress_at_intervals(capsys, monkeypatch):
         for done in (1, 2, 3):
             progress("bake", done, 4)
     assert capsys.readouterr().err.splitlines() == ["bake: 50%"]
+
+
+def test_what_a_run_says_of_itself_does_not_command_the_terminal(call, tmp_path):
+    call("run", "v.npy", "--range", "0.3", "0.9", "--grid", "6", "--paths", "2", "--no-preview", "-o", "out")
+    store.amend(tmp_path / "out", {"input": "a\x1b]0;owned\x07\u202e", "sampler": {"name": "\x1b[2J\x9b2J"}})
+    said = call("info", "out")
+    assert "\\x1b[2J" in said and not {"\x1b", "\x07", "\x9b", "\u202e"} & set(said)

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from illumgrid.cli.terminal import progress_bars, reported_warnings, say
+from illumgrid.cli.terminal import progress_bars, reported_warnings, result, say
 
 
 def bench(
@@ -48,6 +48,6 @@ def bench(
             default = (given.preset.grid, given.preset.paths) if given.preset else (None, PATHS)
             found = race(scene, budget, seed, progress, default, studio)
         content, text = files(found, given.name, scene)
-    typer.echo(text)  # first: it stays where the files do not
+    result(text)  # first: it stays where the files do not
     disk.write_folder(folder, iter(content.items()))
     say(f"wrote {folder}; look at {folder / 'chart.png'}")

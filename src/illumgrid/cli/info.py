@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from illumgrid.cli.reading import Array, Channel, Crop, Downsample, Label, Spacing, Time, given, labels_of
-from illumgrid.cli.terminal import Ignore, omitted_light, reported_warnings
+from illumgrid.cli.terminal import Ignore, omitted_light, reported_warnings, result
 
 if TYPE_CHECKING:
     from illumgrid.field.scene import Quad
@@ -97,10 +97,10 @@ def _describe_volume(source: str, limits: tuple[float, float] | None, inside: "S
     low, high, why = suggest_range(volume, inside)
     if labels:
         (low, high), why = around_zero(volume), "a voxel outside to a voxel inside the surface of the label"
-    typer.echo(f"  suggested range  {shown_range((low, high))}: {why}")
+    result(f"  suggested range  {shown_range((low, high))}: {why}")
     if has_both_signs(volume) and not labels:
         least, most, _ = suggest_magnitudes(volume)
-        typer.echo(
+        result(
             f"  both signs       run --signed --range {shown(least)} {shown(most)} lights the surfaces at +c and -c"
         )
     field = Field(volume_name(source), volume, range=(low, high) if limits is None else limits, inside=inside)  # type: ignore[arg-type]
@@ -109,9 +109,9 @@ def _describe_volume(source: str, limits: tuple[float, float] | None, inside: "S
         values = ", ".join(
             f"{shown(value, volume.extremes, 6)} ({share:.1%} of the cells)" for value, share, _ in flat[:6]
         )
-        typer.echo(f"  plateaus         {values}{f', and {len(flat) - 6} more' if len(flat) > 6 else ''}")
+        result(f"  plateaus         {values}{f', and {len(flat) - 6} more' if len(flat) > 6 else ''}")
     for at, what in critical_isovalues(field):
-        typer.echo(f"  critical         {shown(at, field.range)}: {what}")
+        result(f"  critical         {shown(at, field.range)}: {what}")
     for finding in diagnose(field, nodes_over(volume)):
         tell(finding.name, finding.sentence)
 
@@ -123,24 +123,24 @@ def three(numbers: Any) -> str:
 
 def _describe_wall(quad: "Quad", texture: "WallTexture") -> None:
     rows, nv, nu = texture.values.shape[:3]
-    typer.echo(f"{quad.name} (wall)")
-    typer.echo(f"  corner           {three(quad.corner)}")
-    typer.echo(f"  edges            {three(quad.edge_u)}; {three(quad.edge_v)}")
+    result(f"{quad.name} (wall)")
+    result(f"  corner           {three(quad.corner)}")
+    result(f"  edges            {three(quad.edge_u)}; {three(quad.edge_v)}")
     glow = f", emission {three(quad.material.emission)}" if quad.material.emission.any() else ""
-    typer.echo(f"  albedo           {three(quad.material.albedo)}{glow}")
-    typer.echo(f"  light            {nu} x {nv} texels, {rows} isovalues")
+    result(f"  albedo           {three(quad.material.albedo)}{glow}")
+    result(f"  light            {nu} x {nv} texels, {rows} isovalues")
 
 
 def _describe_lattice(name: str, volume: "Volume") -> None:
     from illumgrid.errors import shown_range
 
-    typer.echo(f"{name}")
-    typer.echo(f"  shape            {' x '.join(map(str, volume.shape))} voxels (x, y, z)")
-    typer.echo(f"  spacing          {three(volume.spacing)}{f' {volume.unit}' if volume.unit else ''}")
-    typer.echo(f"  origin           {three(volume.origin)} (world; for medical formats LPS millimetres)")
-    typer.echo(f"  axes             {'; '.join(three(volume.direction[:, axis]) for axis in range(3))}")
-    typer.echo(f"  values           {shown_range(volume.extremes, 6)}")
-    typer.echo(f"  histogram        |{histogram_line(volume)}| (logarithmic)")
+    result(f"{name}")
+    result(f"  shape            {' x '.join(map(str, volume.shape))} voxels (x, y, z)")
+    result(f"  spacing          {three(volume.spacing)}{f' {volume.unit}' if volume.unit else ''}")
+    result(f"  origin           {three(volume.origin)} (world; for medical formats LPS millimetres)")
+    result(f"  axes             {'; '.join(three(volume.direction[:, axis]) for axis in range(3))}")
+    result(f"  values           {shown_range(volume.extremes, 6)}")
+    result(f"  histogram        |{histogram_line(volume)}| (logarithmic)")
 
 
 def _describe_run(source: str) -> None:
@@ -150,9 +150,9 @@ def _describe_run(source: str) -> None:
     light = load(source)
     for field, grid in zip(light.scene.fields, light.grids):
         _describe_lattice(field.name, field.volume)
-        typer.echo(f"  range            {shown_range(field.range, 6)}, inside {field.inside}")
+        result(f"  range            {shown_range(field.range, 6)}, inside {field.inside}")
         supported = float((grid.support > 0).mean())
-        typer.echo(
+        result(
             f"  light            {' x '.join(map(str, grid.spec.shape))} nodes, {supported:.1%} with light of their own"
         )
     for quad, texture in zip(light.scene.quads, light.walls):
@@ -161,9 +161,9 @@ def _describe_run(source: str) -> None:
     names = ", ".join(
         f"{kind} {recipe[kind]['name']}" for kind in ("sampler", "backend", "interpolator") if kind in recipe
     )
-    typer.echo(
+    result(
         f"recipe: {names}, {recipe.get('paths')} paths, {recipe.get('bounces')} bounces, seed {recipe.get('seed')}"
         f"{omitted_light(recipe)}"
     )
     for sentence in recipe.get("warnings", []):
-        typer.echo(f"note: {sentence}")
+        result(f"note: {sentence}")

@@ -2,6 +2,7 @@
 
 import logging
 import time
+import unicodedata
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -19,7 +20,17 @@ INTERVAL = 10.0  # seconds between two lines of progress where there is no termi
 
 def say(text: str) -> None:
     """Write one line to stderr, so that a pipe carries results only."""
-    typer.echo(text, err=True)
+    typer.echo(harmless(text), err=True)
+
+
+def result(text: str) -> None:
+    """Write to stdout."""
+    typer.echo(harmless(text))
+
+
+def harmless(text: str) -> str:
+    """Text whose control characters are written out: what a file says must not command the terminal."""
+    return "".join(c if c in "\n\t" or unicodedata.category(c) not in ("Cc", "Cf") else ascii(c)[1:-1] for c in text)
 
 
 Ignore = Annotated[
