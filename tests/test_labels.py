@@ -105,3 +105,6 @@ def test_run_of_one_and_of_several_labels(tmp_path, monkeypatch):
     assert done.exit_code == 0 and "-1 to 1: a voxel outside" in done.output
     with pytest.raises(BadInput, match="labels that differ"):
         CliRunner().invoke(app, ["info", "a.npy", "--label", "x"], catch_exceptions=False)
+    for command in (["info", "a.npy"], ["run", "a.npy", "-o", "below"]):
+        with pytest.raises(BadInput, match="--inside and --label came together"):
+            CliRunner().invoke(app, [*command, "--label", "3", "--inside", "below"], catch_exceptions=False)

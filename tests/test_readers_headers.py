@@ -33,6 +33,14 @@ def test_number_of_axes(tmp_path, dims):
     refused(tmp_path / "a.mha", "NDims")
 
 
+@pytest.mark.parametrize("part", [b"Slope = 2", b"Offset = -1024"])
+def test_an_intensity_function_that_is_not_applied_is_a_warning(tmp_path, part):
+    head = meta_head("LOCAL").replace(b"ElementDataFile", b"ElementToIntensityFunction" + part + b"\nElementDataFile")
+    (tmp_path / "a.mha").write_bytes(head + values().tobytes(order="F"))
+    with pytest.warns(IllumgridWarning, match="ElementToIntensityFunction is not applied"):
+        read_volume(tmp_path / "a.mha")
+
+
 @pytest.mark.parametrize("name", ["a.mha", "a.mhd", "a.nrrd", "a.nhdr"])
 def test_every_damage_to_packed_data_is_found(tmp_path, name):
     random = np.random.default_rng(2)
@@ -174,3 +182,12 @@ def test_axis_mins_and_maxs(tmp_path, center, spacing, origin):
     nrrd.write(str(tmp_path / "a.nrrd"), values(), header)
     volume = read_volume(tmp_path / "a.nrrd")
     assert np.allclose(volume.spacing, (spacing, 1, 1)) and np.allclose(volume.origin, (origin, 0, 0))
+
+
+@pytest.mark.parametrize("encoding", ["text", "hex"])
+def test_lines_and_bytes_before_text_are_skipped(tmp_path, encoding):
+    data = values().tobytes(order="F").hex() if encoding == "hex" else " ".join(map(str, values().ravel(order="F")))
+    (tmp_path / "a.txt").write_text("12 34\n12" + data)
+    head = nrrd_head(encoding, "line skip: 1\nbyte skip: 2\ndata file: a.txt\n")
+    (tmp_path / "a.nhdr").write_bytes(head)
+    assert (read_volume(tmp_path / "a.nhdr").values == values()).all()

@@ -56,7 +56,7 @@ def shown(number: float, among: Iterable[float] = (), digits: int = 4) -> str:
 
 
 def shown_range(ends: Iterable[float], digits: int = 4) -> str:
-    """Two numbers as text, "LOW to HIGH", told apart."""
+    """Two numbers as text, "LOW to HIGH", with digits enough to differ."""
     low, high = ends
     return f"{shown(low, (high,), digits)} to {shown(high, (low,), digits)}"
 

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from illumgrid.cli.reading import Array, Channel, Crop, Downsample, Label, Spacing, Time, given, labels_of
+from illumgrid.cli.reading import Array, Channel, Crop, Downsample, Label, Spacing, Time, check_inside, given, labels_of
 from illumgrid.cli.terminal import Ignore, omitted_light, reported_warnings, result
 
 if TYPE_CHECKING:
@@ -59,8 +59,7 @@ def info(
     from illumgrid.errors import BadInput
     from illumgrid.io import store
 
-    if inside not in (None, "above", "below"):
-        raise BadInput(f"--inside is {inside!r}; expected above or below")
+    check_inside(inside, label)
     reading = given(
         spacing=spacing, channel=channel, time=time, array=array, label=label, crop=crop, downsample=downsample
     )

@@ -40,6 +40,14 @@ def labels_of(text: str | None) -> tuple[int, ...]:
     return tuple(map(int, words))
 
 
+def check_inside(inside: str | None, label: str | None) -> None:
+    """Refuse a side that is none, and one beside a label, whose field is positive inside the label."""
+    if inside not in (None, "above", "below"):
+        raise BadInput(f"--inside is {inside!r}; expected above or below")
+    if inside is not None and label is not None:
+        raise BadInput("--inside and --label came together; expected one of them: solid is what has the label")
+
+
 def given(**options: Any) -> dict[str, Any]:
     """The options that were given, as arguments of `read_volume`."""
     return {name: value for name, value in options.items() if value is not None}

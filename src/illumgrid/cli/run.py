@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from illumgrid.cli.reading import Array, Channel, Crop, Downsample, Label, Spacing, Time, given, labels_of
+from illumgrid.cli.reading import Array, Channel, Crop, Downsample, Label, Spacing, Time, check_inside, given, labels_of
 from illumgrid.cli.terminal import Ignore, omitted_light, progress_bars, reported_warnings, say
 from illumgrid.errors import BadInput, shown_range, tell
 
@@ -62,8 +62,7 @@ def _input(
                 f"{options} came with the {what} {name!r}; expected a volume file with them: {todo} them out"
             )
         return Input(name, partial(_smoothed, preset.make), preset) if preset else _scene_file(name)
-    if inside not in (None, "above", "below"):
-        raise BadInput(f"--inside is {inside!r}; expected above or below")
+    check_inside(inside, reading.get("label"))
     if surroundings not in (None, *AROUND):
         raise BadInput(f"--scene is {surroundings!r}; expected {', '.join(AROUND[:-1])} or {AROUND[-1]}")
     if signed and (also := given(inside=inside, label=reading.get("label"))):
@@ -198,7 +197,7 @@ def run(
     interpolator: Annotated[str, typer.Option(help="nearest, bilateral, splat or rbf.")] = "nearest",
     grid: Annotated[
         int | None,
-        typer.Option(min=2, metavar="N", help="Nodes along the longest axis. [default: 1.2 a voxel, at most 150]"),
+        typer.Option(min=2, metavar="N", help="Nodes along the longest axis. [default: 1.2 per voxel, at most 150]"),
     ] = None,
     surroundings: Annotated[
         str | None,
@@ -245,7 +244,9 @@ def run(
     smooth: Annotated[
         float | None, typer.Option(min=0.0, metavar="SIGMA", help="Gaussian blur in voxels before anything else.")
     ] = None,
-    threads: Annotated[int | None, typer.Option(min=1, metavar="N", help="Threads. [default: one a processor]")] = None,
+    threads: Annotated[
+        int | None, typer.Option(min=1, metavar="N", help="Threads. [default: one per processor]")
+    ] = None,
     no_preview: Annotated[bool, typer.Option("--no-preview", help="Leave the picture out.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a finished run in DIR.")] = False,
     ignore: Ignore = None,

@@ -125,10 +125,10 @@ def _chosen(frames: Sequence[Frame], wanted: Wanted, sources: dict[Path, Source]
     kind = stack.frames[0].kind
     shape = (kind.columns, kind.rows, stack.count)
     check_axes(shape)
-    planes, heard = planes_of(stack, sources, wanted)
+    planes, more = planes_of(stack, sources, wanted)
     values, slope, intercept = scaled(planes, stack)
     values = on_lattice(values, stack).transpose(2, 1, 0)
-    return Stored(values, stack.origin, stack.steps, slope, intercept, unit="mm", notes=(*notes, *stack.notes, *heard))
+    return Stored(values, stack.origin, stack.steps, slope, intercept, unit="mm", notes=(*notes, *stack.notes, *more))
 
 
 def _series(frames: Sequence[Frame], wanted: Wanted) -> tuple[list[Frame], list[Note]]:

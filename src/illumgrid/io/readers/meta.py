@@ -55,7 +55,10 @@ def read(source: Source, wanted: Wanted) -> Stored:
         values, more = _data(source, stream, fields, names, np.dtype(order + TYPES[kind]), (channels, *sizes))
     if more:
         notes = (*notes, ("file", f"{more} bytes follow its data, of which its header says nothing; they are left out"))
-    if float(fields.get("ElementToIntensityFunctionSlope", 1)) != 1:
+    intensity = [
+        float(fields.get(f"ElementToIntensityFunction{part}", none)) for part, none in (("Slope", 1), ("Offset", 0))
+    ]
+    if intensity != [1, 0]:
         notes = (
             *notes,
             ("file", "its ElementToIntensityFunction is not applied: values are as stored, as ITK has them"),

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from illumgrid.errors import BadInput
 from illumgrid.io.readers.limits import CHUNK, check_axes, check_size
-from illumgrid.io.readers.reports import heard, plain
+from illumgrid.io.readers.reports import captured, plain
 from illumgrid.io.readers.source import Source, find_source, finish, opened, read_array
 from illumgrid.io.readers.stored import Note, Stored, Wanted, pick
 
@@ -39,7 +39,7 @@ def read(source: Source, wanted: Wanted) -> Stored:
 
 def _read(source: Source, wanted: Wanted) -> Stored:
     head, data = _pair(source)
-    with heard("nibabel.global") as reports, opened(head) as stream:
+    with captured("nibabel.global") as reports, opened(head) as stream:
         header = _header(stream)
         single = data is head
         dtype, shape = header.get_data_dtype(), tuple(int(n) for n in header.get_data_shape())
@@ -129,12 +129,12 @@ def _place(header: Any) -> tuple[tuple[NDArray[np.float64], NDArray[np.float64]]
     if sform is None or qform is None:
         return in_lps(qform if sform is None else sform), ()
     corners = np.array(list(np.ndindex(2, 2, 2))) * (np.array(header.get_data_shape()[:3]) - 1)
-    apart = corners @ (sform - qform)[:3, :3].T + (sform - qform)[:3, 3]
-    far = float(np.linalg.norm(apart, axis=1).max() / min(header.get_zooms()[:3]))
+    between = corners @ (sform - qform)[:3, :3].T + (sform - qform)[:3, 3]
+    far = float(np.linalg.norm(between, axis=1).max() / min(header.get_zooms()[:3]))
     if far < SAME:
         return in_lps(qform), ()
-    told = f"its qform and sform place a voxel up to {far:.3g} voxels differently; the sform was taken, as nibabel does"
-    return in_lps(sform), ((("placement", told),) if far > FAR else ())
+    text = f"its qform and sform place a voxel up to {far:.3g} voxels differently; the sform was taken, as nibabel does"
+    return in_lps(sform), ((("placement", text),) if far > FAR else ())
 
 
 _UNPLACED = "which does not say how its axes lie: x to the left and the middle at 0 was taken, as nibabel does"

@@ -242,6 +242,10 @@ def _data(
 
     def part(of: Source, stream: IO[bytes], dims: tuple[int, ...]) -> tuple[NDArray[Any], int]:
         count = math.prod(dims)
+        for _ in range(min(lines, 1 << 16)):
+            stream.readline(CHUNK)
+        if encoding in ("ascii", "text", "txt", "hex"):
+            stream.read(max(0, min(skip, CHUNK)))
         if encoding in ("ascii", "text", "txt"):
             check_size(count, of.most, count * (8 + dtype.itemsize))
             return read_text(stream, count).astype(dtype).reshape(dims, order="F"), 0
@@ -255,8 +259,6 @@ def _data(
             )
         packing = PACKINGS[encoding]
         check_size(count * dtype.itemsize, of.most_inside(packing), count * dtype.itemsize)
-        for _ in range(min(lines, 1 << 16)):
-            stream.readline(CHUNK)
         if skip == -1 and packing == "raw" and not of.packed:
             stream.seek(of.size - count * dtype.itemsize)
         with inflated(stream, packing) as unpacked:

@@ -16,7 +16,7 @@ class _Kept(logging.Handler):
 
 
 @contextmanager
-def heard(logger: str) -> Iterator[list[str]]:
+def captured(logger: str) -> Iterator[list[str]]:
     """The reports of a library's logger, in place of the terminal."""
     kept, log = _Kept(), logging.getLogger(logger)
     propagated, others = log.propagate, log.handlers

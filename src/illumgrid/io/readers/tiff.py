@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from illumgrid.errors import BadInput
 from illumgrid.io.readers.limits import check_axes, check_memory, check_size
-from illumgrid.io.readers.reports import heard, plain
+from illumgrid.io.readers.reports import captured, plain
 from illumgrid.io.readers.source import AGAIN, Source, find_source, seekable
 from illumgrid.io.readers.stored import Note, Stored, Wanted, pick
 from illumgrid.io.readers.tiff_spacing import calibrated, channel_names
@@ -96,7 +96,7 @@ def _opened_tiff(source: Source) -> Iterator[tuple[Any, list[str]]]:
     try:
         # tifffile reads on where pages or tags are lost, and reports it.
         with (
-            heard("tifffile") as reports,
+            captured("tifffile") as reports,
             seekable(source) as stream,
             tifffile.TiffFile(stream, name=source.name, _multifile=False) as tiff,
         ):

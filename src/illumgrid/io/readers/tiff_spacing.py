@@ -35,9 +35,9 @@ def calibrated(tiff: Any, series: int) -> Found:
     if tiff.is_lsm and (about := tiff.lsm_metadata):
         return _checked([1e6 * float(about.get(f"VoxelSize{axis}", 0)) for axis in "XYZ"], "µm")
     if tiff.is_stk and (about := tiff.stk_metadata) and about.get("XCalibration"):
-        apart = float(np.mean(about.get("ZDistance", 0)))
+        depth = float(np.mean(about.get("ZDistance", 0)))
         unit = _unit(about.get("CalibrationUnits"))
-        return _checked([float(about["XCalibration"]), float(about["YCalibration"]), apart], unit)
+        return _checked([float(about["XCalibration"]), float(about["YCalibration"]), depth], unit)
     x, y = (_size(tiff.pages.first, tag) for tag in ("XResolution", "YResolution"))
     if tiff.is_imagej and (about := tiff.imagej_metadata) is not None:
         unit = _unit(about.get("unit"))
@@ -80,10 +80,10 @@ def _by_ome(pixels: dict[str, Any]) -> Found:
         unit = _unit(pixels.get(f"PhysicalSize{axis}Unit", "µm"))
         sizes.append(size * scale.get(unit or "", math.nan))
     if not any(math.isfinite(size) for size in sizes):
-        told = (
+        text = (
             "its OME description does not say how far its voxels are from each other; 1, 1, 1 was taken; give --spacing"
         )
-        return np.ones(3), None, (("spacing", told),)
+        return np.ones(3), None, (("spacing", text),)
     return _checked(sizes, "µm")
 
 
@@ -95,8 +95,8 @@ def _checked(sizes: Sequence[float], unit: str | None) -> Found:
         return found, unit, ()
     known = found[good][0] if good.any() else 1.0
     lacking = " and ".join(axis for axis, fine in zip("xyz", good) if not fine)
-    told = f"does not say how far its voxels are from each other along {lacking}; {known:g} was taken; give --spacing"
-    return np.where(good, found, known), unit, (("spacing", told),)
+    text = f"does not say how far its voxels are from each other along {lacking}; {known:g} was taken; give --spacing"
+    return np.where(good, found, known), unit, (("spacing", text),)
 
 
 def _by_resolution(tiff: Any, x: float, y: float) -> Found:
@@ -106,14 +106,14 @@ def _by_resolution(tiff: Any, x: float, y: float) -> Found:
     dpi = 25.4 / width if width else 0.0
     if not (math.isfinite(width) and width > 0 and height > 0) or (width == height and round(dpi) in PRINTING):
         said = f", only {dpi:.4g} dots per inch, as for printing" if dpi and math.isfinite(dpi) else ""
-        told = f"does not say how far its voxels are from each other{said}; 1, 1, 1 was taken; give --spacing"
-        return np.ones(3), None, (("spacing", told),)
+        text = f"does not say how far its voxels are from each other{said}; 1, 1, 1 was taken; give --spacing"
+        return np.ones(3), None, (("spacing", text),)
     depth = width if math.isclose(width, height, rel_tol=1e-6) else 1.0
-    told = (
+    text = (
         f"its resolution says {width:.4g} x {height:.4g} mm for a pixel, but nothing how far slices are from each "
         f"other; {depth:.4g} mm was taken; give --spacing"
     )
-    return np.array([width, height, depth]), "mm", (("spacing", told),)
+    return np.array([width, height, depth]), "mm", (("spacing", text),)
 
 
 def _size(page: Any, tag: str) -> float:
