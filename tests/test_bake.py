@@ -1,16 +1,23 @@
 """The accumulator: walks go on, combine, and come back from plain arrays."""
 
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
 from io import BytesIO
+from typing import ClassVar
 
 import numpy as np
 import pytest
 
+import illumgrid as ig
+from illumgrid.accuracy.chart.contestants import Method
+from illumgrid.accuracy.chart.race import Run
 from illumgrid.backends.numba_ import Numba
 from illumgrid.bake import Bake, shifted_seed, wall_queries
 from illumgrid.field.scene import Scene, level_table
 from illumgrid.grid import GridSpec
+from illumgrid.interpolators.nearest import Nearest
 from illumgrid.samplers.direct import Direct
+from illumgrid.transport.samples import Samples, join_queries
 from illumgrid.transport.tracer import prepare
 from shapes import ball, refused
 
@@ -87,3 +94,95 @@ def test_any_map_gives_the_same_and_tells_how_far_it_is(begun):
 
 def test_seeds_beside_a_seed_stay_within_64_bits():
     assert shifted_seed(2**64 - 1, 1) == 0 and shifted_seed(5, 2**63) == 2**63 + 5
+
+
+def test_bakes_of_another_seed_are_refused_and_one_that_has_not_walked_takes_nothing_away(begun):
+    tracer, bake = begun
+    found = bake.walk(tracer, range(4))
+    same(found.merge(bake), found)
+    same(bake.merge(found), found)
+    refused(lambda: found.merge(replace(bake, seed=1).walk(tracer, range(4, 8))), "seed", "same")
+
+
+@dataclass(frozen=True)
+class InOneBatch:
+    """The nodes of all fields in one batch."""
+
+    name: ClassVar[str] = "in-one-batch"
+
+    def queries(self, scene, specs, seed):
+        yield join_queries(list(Direct().queries(scene, specs, seed)))
+
+
+@dataclass(frozen=True)
+class FirstField:
+    """The nodes of the first field, and none of the others."""
+
+    name: ClassVar[str] = "first-field"
+
+    def queries(self, scene, specs, seed):
+        yield from (q for q in Direct().queries(scene, specs, seed) if q.target[0] == 0)
+
+
+def pair():
+    """Two balls side by side over a floor."""
+    one = Scene.floor(ball(9), range=(0.4, 0.9))
+    volume = one.fields[0].volume
+    beside = replace(volume, origin=volume.origin + np.array([3.0, 0.0, 0.0]))
+    return replace(one, fields=(one.fields[0], replace(one.fields[0], name="other", volume=beside)))
+
+
+def test_a_batch_may_hold_several_fields_beside_walls():
+    small = {"grid": 6, "paths": 2, "bounces": 1, "isovalues": 2, "judge": False}
+    one, other = (ig.run(pair(), sampler=sampler, **small) for sampler in (Direct(), InOneBatch()))
+    for a, b in zip((*one.grids, *one.walls), (*other.grids, *other.walls), strict=True):
+        np.testing.assert_array_equal(a.values, b.values)
+
+
+@pytest.mark.parametrize("sampler, lit", [(InOneBatch(), [True, True]), (FirstField(), [True, False])])
+def test_a_race_gives_each_field_its_own_samples(sampler, lit):
+    scene = pair()
+    tracer = prepare(Numba(), scene)
+    found = []
+    for way in (Direct(), sampler):
+        run = Run(scene, Method(way, Numba(), tracer, "levelset", (Nearest(),)), 6, 1, 0)
+        run.go_on(2)
+        found.append(run.fill(Nearest())[0])
+    for a, b, asked in zip(*found, lit, strict=True):
+        np.testing.assert_array_equal(a.support * asked, b.support)
+
+
+def test_an_interpolator_may_have_an_argument_of_its_own():
+    @dataclass(frozen=True)
+    class Powered:
+        name: ClassVar[str] = "powered"
+
+        def fill(self, samples, nodes, power=2.0):
+            return Nearest().fill(samples, nodes)
+
+    light = ig.run(pair(), interpolator=Powered(), grid=6, paths=2, bounces=1, isovalues=2, judge=False)
+    assert light.grids[0].support.any()
+
+
+@dataclass(frozen=True)
+class Plain:
+    """A backend that knows RGB only and does not say which surface it uses."""
+
+    name: ClassVar[str] = "plain"
+
+    def solve(self, scene, queries, **about):
+        found = Numba().solve(scene, queries, **about)
+        return Samples(queries, np.array(found.mean), np.array(found.m2), found.paths)
+
+
+def test_light_of_a_backend_that_cannot_be_judged_is_kept():
+    with pytest.warns(ig.IllumgridWarning, match="could not be measured.*geometry"):
+        light = ig.run(pair(), backend=Plain(), grid=6, paths=2, bounces=1, isovalues=2, judge=True)
+    assert light.recipe["reached"] is None and light.grids[0].mean > 0
+
+
+def test_lights_that_a_backend_summed_are_not_mixed():
+    light = ig.run(
+        Scene.studio(ball(9), range=(0.4, 0.9)), backend=Plain(), grid=6, paths=2, bounces=1, isovalues=2, judge=False
+    )
+    refused(lambda: light.mix(**{light.lights[0]: 0.5}), "sum", "numba")

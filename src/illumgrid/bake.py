@@ -115,8 +115,13 @@ class Bake:
 
     def merge(self, other: "Bake") -> "Bake":
         """Combine with a bake of the same targets and seed that walked other paths."""
-        if not self.answers:
-            return other
+        if (self.bounces, self.seed) != (other.bounces, other.seed):
+            raise BadInput(
+                f"a bake of {self.bounces} bounces and seed {self.seed} met one of {other.bounces} and {other.seed}; "
+                "expected the same to combine"
+            )
+        if not self.answers or not other.answers:
+            return self if self.answers else other
         if any(max(a.start, b.start) < min(a.stop, b.stop) for a in self.walked for b in other.walked):
             raise BadInput(f"paths {self.walked} and {other.walked} overlap; expected disjoint ranges to combine")
         answers = tuple(combine(a, b) for a, b in zip(self.answers, other.answers))
@@ -327,7 +332,7 @@ def bake(
     map : callable, optional
         What spreads the batches: the built-in ``map``, or that of an executor or cluster.
     progress : callable, optional
-        Told (what, done, total).
+        Called with (what, done, total).
     """
     clock = [time.perf_counter()]
     nodes = [batch for batch in sampler.queries(scene, specs, seed) if len(batch)]
@@ -344,8 +349,8 @@ def bake(
     grids, answers, walked = [], list(state.answers), state.paths
     del state
     for number, spec in enumerate(specs):
-        samples = _of_field(scene, answers, number)
-        answers = [a for a in answers if (a.queries.target != number).any()]  # a large run is held once, not twice
+        samples = of_field(scene, answers, number)
+        answers = [a for a in answers if (a.queries.target > number).any()]  # a large run is held once, not twice
         grids.append(fill_nodes(interpolator, samples, Nodes(spec, scene.fields[number], number)))
         del samples
         progress("grid", number + 1, len(specs))
@@ -363,7 +368,8 @@ def bake(
     )
 
 
-def _of_field(scene: Scene, answers: Sequence[Samples], number: int) -> Samples:
+def of_field(scene: Scene, answers: Sequence[Samples], number: int) -> Samples:
+    """Samples of one field; a batch may hold several fields, and a field may have none."""
     own = [a if (a.queries.target == number).all() else a[a.queries.target == number] for a in answers]
     if own := [a for a in own if len(a)]:
         return join_samples(own)

@@ -187,10 +187,11 @@ def judged(light: Illumination, backend: Backend) -> Illumination:
     backend : Backend
         The one that computed it.
     """
-    can, recipe = capabilities(backend), light.recipe
-    if not can.transport or can.surface != "levelset":
-        return light
+    recipe = light.recipe
     try:
+        can = capabilities(backend)
+        if not can.transport or can.surface != "levelset":
+            return light
         tracer = prepare(registry.backend("auto"), light.scene)  # of the same surface, and quick
         about = (recipe[key] for key in ("seed", "queries", "paths", "bounces"))
         found = measure_error(light.scene, tracer, light.grids, *about)

@@ -186,7 +186,7 @@ def planned(
     begun = time.perf_counter()
     left = np.inf if seconds is None else JUDGED * seconds
     goal = Goal(error, left, sum(len(queries) for queries in wall_queries(scene, levels)), paths, bounces)
-    candidates = [grid] if grid else sizes(scene)
+    candidates = sizes(scene) if grid is None else [grid]
     depth = 4 if scene.open else 12  # light lives long in a closed room
     middle = specs_over(scene, candidates[len(candidates) // 2])
     search = Search(scene, tracer, goal, measure_pace(scene, tracer, middle, 32, depth, seed, 1 << 14))

@@ -104,8 +104,18 @@ def mixed(channels: Channels, layers: Sequence[Layer], weights: Mapping[str, flo
         Those of the scene; of a sky in spherical harmonics with the coefficients of another sky, perhaps.
     weights : mapping
         From the name of a layer to a number.
+
+    Raises
+    ------
+    BadInput
+        If the channels are the sum of several layers alone, as those of a backend that knows RGB only.
     """
     known, rows = {layer.name: layer for layer in layers}, []
+    if len(layers) > 1 and not any("." in name for name in channels.names):
+        raise BadInput(
+            f"this light has only the sum of {', '.join(known)}; expected channels for each to mix: run it with a "
+            "backend and an interpolator that keep them, such as numba and nearest"
+        )
     for name in channels.names:
         layer, _, color = name.rpartition(".")
         only = np.array(GREY_MIX[0] if color == "Y" else RGB_MIX["RGB".index(color)])

@@ -81,7 +81,7 @@ def _measure(case: Case, backend: Backend, paths: int, seed: int) -> tuple[Float
             0.5 * (one.mean.astype(float) + other.mean.astype(float)),
             0.5 * np.hypot(one.stderr, other.stderr, dtype=float),
         )
-        # Bars allow for what few paths may have missed; how far two seeds are apart tells the noise that there is.
+        # Bars allow for what few paths may have missed; the difference of two seeds measures the noise itself.
         off = 0.5 * (one.mean.astype(float) - other.mean)[good]
         share = min(1.0, np.sqrt((off**2).sum() / (bar[good] ** 2).sum())) if good.any() and off.any() else 0.0
         return light, bar, good, float(share)

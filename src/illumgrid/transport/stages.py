@@ -150,11 +150,11 @@ class Interpolator(Protocol):
 def fill_nodes(interpolator: Interpolator, samples: Samples, nodes: Nodes) -> IlluminationGrid:
     """Fill nodes by an interpolator, which may have the former signature ``fill(samples, spec, field)``."""
     try:
-        inspect.signature(interpolator.fill).bind("samples", "spec", "field")
+        inspect.signature(interpolator.fill).bind("samples", "nodes")
     except TypeError:
-        return interpolator.fill(samples, nodes)
-    former: Callable[..., IlluminationGrid] = interpolator.fill
-    return former(samples, nodes.spec, nodes.number)
+        former: Callable[..., IlluminationGrid] = interpolator.fill
+        return former(samples, nodes.spec, nodes.number)
+    return interpolator.fill(samples, nodes)
 
 
 @_hookspec

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from illumgrid.accuracy.chart.contestants import COUNTS, Method
 from illumgrid.accuracy.reference import Reference, errors, look_up
-from illumgrid.bake import Bake, shifted_seed
+from illumgrid.bake import Bake, of_field, shifted_seed
 from illumgrid.errors import BadInput
 from illumgrid.field.lattice import specs_over
 from illumgrid.field.scene import Scene
@@ -18,7 +18,7 @@ from illumgrid.field.volume import Floats
 from illumgrid.grid import GridSpec, IlluminationGrid, Nodes
 from illumgrid.samplers.direct import corners
 from illumgrid.stages import Interpolator
-from illumgrid.transport.samples import Queries, join_samples
+from illumgrid.transport.samples import Queries
 from illumgrid.transport.stages import fill_nodes
 
 STEPS = (8, 32, 128, 512, 2048)  # paths; `run`'s default is one of them
@@ -84,8 +84,8 @@ class Run:
         begun = time.perf_counter()
         grids = []
         for number, spec in enumerate(self.specs):
-            own = [a for a in self.bake.answers if a.queries.target[0] == number]
-            grids.append(fill_nodes(interpolator, join_samples(own), Nodes(spec, self.scene.fields[number], number)))
+            own = of_field(self.scene, self.bake.answers, number)
+            grids.append(fill_nodes(interpolator, own, Nodes(spec, self.scene.fields[number], number)))
         return grids, self.asking + self.tracing + time.perf_counter() - begun
 
 
