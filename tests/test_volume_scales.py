@@ -136,6 +136,8 @@ def test_exports_keep_the_digits(tmp_path):
         assert np.allclose(back.in_units(back.values.astype(float)), 1e6 + 0.2 * ball(), rtol=0, atol=1e-7)
     with np.load(tmp_path / "a.npz") as arrays:
         assert np.allclose(arrays["field"], 1e6 + 0.2 * ball(), rtol=0, atol=1e-7)
+    with pytest.raises(ig.BadInput, match="double precision"):
+        exports.write(light, tmp_path / "a.exr", on="field")
 
 
 def test_a_scene_file_takes_ranges_of_any_scale(tmp_path):

@@ -34,12 +34,12 @@ def bench(
     """
     from illumgrid.accuracy.chart import bench as race
     from illumgrid.cli.report import files
-    from illumgrid.cli.run import _input
+    from illumgrid.cli.run import scene_input
     from illumgrid.constants import PATHS
     from illumgrid.io import disk
     from illumgrid.show.difference import studio
 
-    given = _input(source, None, limits, None, False, None, {})
+    given = scene_input(source, None, limits, None, False, None, {})
     folder = output or Path(f"{given.name}-bench")
     disk.claim_new(folder)
     with reported_warnings():

@@ -37,7 +37,7 @@ class Input:
     preset: "Preset | None" = None
 
 
-def _input(
+def scene_input(
     source: str | None,
     surroundings: str | None,
     limits: tuple[float, float] | None,
@@ -267,7 +267,7 @@ def run(
         reading = given(
             spacing=spacing, channel=channel, time=time_step, array=array, label=label, crop=crop, downsample=downsample
         )
-        asked = _input(source, surroundings, limits, inside, signed, albedo, reading)
+        asked = scene_input(source, surroundings, limits, inside, signed, albedo, reading)
         if asked.preset and error is None and seconds is None:
             grid, paths = grid or asked.preset.grid, paths or asked.preset.paths
             isovalues = isovalues or asked.preset.isovalues
@@ -363,7 +363,7 @@ def _advise(light: "Illumination", stages: dict[str, Any]) -> None:
 def _again(options: str) -> str:
     """The command line of this process, with another blur, in place of its result."""
     words = ["illumgrid", *sys.argv[1:]]
-    for at in [k for k, word in enumerate(words) if word == "--smooth"]:
+    for at in [k for k, word in enumerate(words) if word == "--smooth"][::-1]:
         words[at : at + 2] = []
     words = [word for word in words if not word.startswith("--smooth=") and word != "--overwrite"]
     return f"{shlex.join(words)} {options} --overwrite"

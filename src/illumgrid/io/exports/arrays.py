@@ -136,6 +136,8 @@ def write_exr(path: Path, points: Points, progress: "Progress") -> None:
 
     from illumgrid.io.store import LAYOUT
 
+    if points.arrays["field"].dtype == np.float64:
+        raise BadInput("the field's values need double precision, which .exr lacks; expected .vti, .nrrd or .npz")
     nx, ny, nz = points.lattice.shape
     progress("file", 0, 1)
     header = {

@@ -46,8 +46,7 @@ def _read(source: Source, wanted: Wanted) -> Stored:
         if dtype.kind not in "biuf" or dtype.itemsize > 8:
             what = "a complex number" if dtype.kind == "c" else f"of the type {dtype}"
             raise BadInput(f"each voxel is {what}; expected one real number; save the magnitude or one channel")
-        steps = shape[:3] + tuple(n for n in shape[3:])
-        if len(shape) < 3 or min(steps) < 1 or math.prod(shape[5:]) != 1:
+        if len(shape) < 3 or min(shape) < 1 or math.prod(shape[5:]) != 1:
             check_axes(shape)
         time = pick(wanted.time, "time", [""] * (shape[3] if len(shape) > 3 else 1))
         channel = pick(wanted.channel, "channel", [""] * (shape[4] if len(shape) > 4 else 1))
