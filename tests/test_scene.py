@@ -9,7 +9,6 @@ import pytest
 from illumgrid.errors import IllumgridWarning
 from illumgrid.field.boundaries import suggest_range
 from illumgrid.field.scene import Field, Material, Scene, level_table
-from illumgrid.field.signed import has_both_signs, suggest_magnitudes
 from illumgrid.field.volume import Volume
 from illumgrid.io.readers import read_volume
 from shapes import DIRECTIONS, MIRRORED, OBLIQUE, ball, refused, sky
@@ -170,7 +169,7 @@ def test_the_suggestion_for_real_data_holds_the_known_isovalues(file):
     The middle, which pictures show, is not beyond all of them. For thin structures it is near the low end.
     """
     volume, known = read_volume(VOLUMES / file), known_isovalues()[file]
-    low, high, _ = (suggest_magnitudes if has_both_signs(volume) else suggest_range)(volume)
+    low, high, _ = suggest_range(volume)
     assert all(low <= last and high >= 0.95 * first for first, last in known)
     lowest, highest = volume.extremes
     assert lowest < low and high < 0.95 * highest + 0.05 * lowest + 1e-6

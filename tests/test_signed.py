@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 import illumgrid as ig
+from illumgrid.field.boundaries import has_both_signs, suggest_magnitudes, suggest_range
 from illumgrid.field.scene import Field, Scene, level_table
-from illumgrid.field.signed import has_both_signs, signed_pair, suggest_magnitudes
+from illumgrid.field.signed import signed_pair
 from illumgrid.field.volume import Volume
 from illumgrid.samplers.adaptive import adaptive_rows
 from illumgrid.show.viewer.packing import packed
@@ -94,6 +95,25 @@ def test_signs_are_noticed_where_both_mean_something():
     noise[4, 4, 4] = 1
     for values in (noise, ball(9).values, np.abs(orbital().values)):
         assert not has_both_signs(Volume(values))
+
+
+@pytest.mark.parametrize("farther", [1, 3])
+def test_without_signed_the_suggested_range_stays_on_the_solids_side_of_zero(farther):
+    """A range across 0 sweeps the whole volume: one block with caps, and no lobe."""
+    h = orbital().values
+    volume = Volume(
+        np.where(h < 0, farther * h, h).astype(float) * 10 - 5, slope=0.1, intercept=0.5
+    )  # h as it is stored
+    low, high, why = suggest_range(volume)
+    lobe = h[h > 0.5 * (low + high)]
+    assert 0 < low < high < h.max() and "positive side" in why and 20 < lobe.size < 0.2 * h.size
+    assert Field("o", volume).range.tolist() == [low, high]
+    if farther == 1:
+        assert (low, high) == suggest_magnitudes(volume)[:2]
+    least, most, why = suggest_range(volume, "below")
+    assert volume.extremes[0] < least < most < 0 and "negative side" in why
+    turned = suggest_range(volume.with_values(-10 - volume.values), "below")
+    assert turned[:2] == pytest.approx((-high, -low), rel=1e-6)
 
 
 def test_the_command_line_lights_both_signs(call, refuse, tmp_path):

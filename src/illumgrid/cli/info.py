@@ -77,12 +77,11 @@ def info(
 
 def _describe_volume(source: str, limits: tuple[float, float] | None, inside: "Side", reading: dict[str, Any]) -> None:
     from illumgrid.errors import BadInput, shown, shown_range, tell
-    from illumgrid.field.boundaries import suggest_range
+    from illumgrid.field.boundaries import has_both_signs, suggest_magnitudes, suggest_range
     from illumgrid.field.diagnosis import critical_isovalues, diagnose, plateaus
     from illumgrid.field.labels import around_zero
     from illumgrid.field.lattice import nodes_over
     from illumgrid.field.scene import Field
-    from illumgrid.field.signed import has_both_signs, suggest_magnitudes
     from illumgrid.field.volume import finite
     from illumgrid.io import needs
     from illumgrid.io.readers import read_volume, volume_name
@@ -99,9 +98,7 @@ def _describe_volume(source: str, limits: tuple[float, float] | None, inside: "S
     result(f"  suggested range  {shown_range((low, high))}: {why}")
     if has_both_signs(volume) and not labels:
         least, most, _ = suggest_magnitudes(volume)
-        result(
-            f"  both signs       run --signed --range {shown(least)} {shown(most)} lights the surfaces at +c and -c"
-        )
+        result(f"  both signs       run --signed --range {shown(least)} {shown(most)} lights the surfaces at +c and -c")
     field = Field(volume_name(source), volume, range=(low, high) if limits is None else limits, inside=inside)  # type: ignore[arg-type]
     if flat := plateaus(volume):
         flat.sort(key=lambda one: -one[1])

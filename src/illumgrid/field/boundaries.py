@@ -6,6 +6,9 @@ computational approach to edge detection", PAMI 8(6), 1986). The values at such 
 for: those whose surfaces are steep.
 """
 
+from collections.abc import Callable
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -25,6 +28,8 @@ _THIN = 1 / 3  # share of the voxels of a solid whose six neighbours belong to i
 _VALLEY, _FLANK = 0.7, 0.5  # density of boundaries, over that of the lower peak beside it, and of the nearest peak
 _BINS = 64  # of the density of the boundaries' values
 _INSIDE = 0.05  # of the span of the data, by which a range stays away from their ends
+_BALANCED = 0.3  # smaller over larger extreme of a field of both signs
+_SMALL = 0.1  # of the smaller extreme: most of the voxels of such a field are nearer to 0
 
 
 def suggest_range(volume: Volume, inside: Side = "above") -> tuple[float, float, str]:
@@ -38,7 +43,8 @@ def suggest_range(volume: Volume, inside: Side = "above") -> tuple[float, float,
         its middle is at the deeper one. Boundaries of fibres lie at half of what they reach, from faint to bright: if
         the object at the middle is thin, the middle becomes the geometric mean of the ends, where fibres hang together.
         Fields without boundaries (too small, or of one slope) get Otsu's threshold [1]_ and the median of what lies
-        inside it. With `inside` "below" the same is done for -h.
+        inside it. With `inside` "below" the same is done for -h. Fields of both signs get the range of
+        `suggest_magnitudes` on the solid's side of 0: across 0 the solid becomes the whole volume.
     why : str
         The reason, one sentence with the numbers.
 
@@ -51,6 +57,42 @@ def suggest_range(volume: Volume, inside: Side = "above") -> tuple[float, float,
     ----------
     .. [1] N. Otsu, "A threshold selection method from gray-level histograms", IEEE Trans. SMC 9(1), 1979.
     """
+    return _on_one_side(volume, inside) if has_both_signs(volume) else _suggest(volume, inside)
+
+
+def suggest_magnitudes(volume: Volume) -> tuple[float, float, str]:
+    """Suggest a range of c for the surfaces at +c and -c: what `suggest_range` says of the absolute value of h."""
+    return _suggest(_parts(volume, np.abs), "above")
+
+
+def has_both_signs(volume: Volume) -> bool:
+    """Whether the finite values reach about as far below 0 as above, and most of them are near 0."""
+    low, high = volume.extremes
+    if not low < 0 < high or min(-low, high) < _BALANCED * max(-low, high):
+        return False
+    ends = volume.to_stored(np.array([-_SMALL, _SMALL]) * min(-low, high))
+    return bool(((volume.values > ends[0]) & (volume.values < ends[1])).mean() > 0.5)
+
+
+def _parts(volume: Volume, part: Callable[[Floats], Floats]) -> Volume:
+    """The volume with a function of h, 0 where h is not finite."""
+    h = np.nan_to_num(volume.in_units(volume.values.astype(float)), nan=0.0, posinf=0.0, neginf=0.0)
+    return replace(volume, values=part(h), slope=1.0, intercept=0.0)  # type: ignore[arg-type]  # it converts
+
+
+def _on_one_side(volume: Volume, inside: Side) -> tuple[float, float, str]:
+    """The range for h >= c > 0, or h <= c < 0, of a field of both signs."""
+    sign = UPWARD[inside]
+    reach = max(sign * x for x in volume.extremes)
+    low, high, why = suggest_magnitudes(volume)
+    if high > reach:  # the other side reaches farther
+        low, high, why = _suggest(_parts(volume, lambda h: np.maximum(sign * h, 0)), "above")
+    low, high = sorted((sign * low, sign * high))
+    side = "positive" if sign > 0 else "negative"
+    return low, high, f"the field has both signs, this is the {side} side; without the sign {why}"
+
+
+def _suggest(volume: Volume, inside: Side) -> tuple[float, float, str]:
     volume = _varying(volume, inside)
     value, slope = _boundary_voxels(volume, inside)
     if len(value) < _FEWEST:

@@ -1,30 +1,16 @@
 """Fields of both signs (orbitals, differences, phases): the surfaces at +c and -c, swept outward together."""
 
-from dataclasses import replace
-
 import numpy as np
 from numpy.typing import ArrayLike
 
 from illumgrid.errors import BadInput, shown_range, tell
-from illumgrid.field.boundaries import suggest_range
+from illumgrid.field.boundaries import suggest_magnitudes
 from illumgrid.field.labels import COLOURS
 from illumgrid.field.scene import Field, Material
 from illumgrid.field.volume import Volume
 
 POSITIVE, NEGATIVE = COLOURS[1], COLOURS[2]
 """Albedos of h >= c and of h <= -c: vermilion and blue."""
-
-_BALANCED = 0.3  # smaller over larger extreme
-_SMALL = 0.1  # of the smaller extreme: most of the voxels of such a field are nearer to 0
-
-
-def has_both_signs(volume: Volume) -> bool:
-    """Whether the finite values reach about as far below 0 as above, and most of them are near 0."""
-    low, high = volume.extremes
-    if not low < 0 < high or min(-low, high) < _BALANCED * max(-low, high):
-        return False
-    ends = volume.to_stored(np.array([-_SMALL, _SMALL]) * min(-low, high))
-    return bool(((volume.values > ends[0]) & (volume.values < ends[1])).mean() > 0.5)
 
 
 def without_gaps(volume: Volume) -> Volume:
@@ -34,13 +20,6 @@ def without_gaps(volume: Volume) -> Volume:
         return volume
     tell("finite", f"{int(good.size - good.sum())} of {good.size} voxels are not finite: they became 0", stacklevel=2)
     return volume.with_values(np.where(good, volume.values, np.float32(volume.to_stored(0.0))))
-
-
-def suggest_magnitudes(volume: Volume) -> tuple[float, float, str]:
-    """Suggest a range of c for the surfaces at +c and -c: what `suggest_range` says of the absolute value of h."""
-    return suggest_range(
-        replace(volume, values=np.abs(volume.in_units(volume.values.astype(float))), slope=1.0, intercept=0.0)
-    )
 
 
 def signed_pair(
