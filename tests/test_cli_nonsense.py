@@ -52,6 +52,11 @@ READING = {
     "--crop": [*(f"{n}|8|0|8|0|8" for n in (*WORDS, "-1", "7", HUGE)), "0|1|0|8|0|8", "5|2|0|8|0|8"],
     "--downsample": [*WORDS, "-1", "0", HUGE],
 }
+LIGHT = {
+    "--light": [*NAMES, "sky=", "sky=two", "sky=nan", "=1", "nonsense=1"],
+    "--sky": ["missing", "folder", "v.npy", "text.txt", "", "x" * 300],
+    "--turn": [*NUMBERS, "30"],
+}
 REFUSED = {
     ("run", "source"): SOURCES,
     ("run", "--output"): ["v.npy", "v.npy/x", "sealed/new", "x" * 300, "", ".", "/", "folder", "dangling", "out"],
@@ -75,6 +80,11 @@ REFUSED = {
     ("run", "--scene"): NAMES,
     ("run", "--albedo"): [f"{n}|0.5|0.5" for n in (*NUMBERS, "-1", "1.5", HUGE)],
     **{(command, option): values for command in ("run", "info") for option, values in READING.items()},
+    **{(command, option): values for command in ("preview", "view", "export") for option, values in LIGHT.items()},
+    ("run", "--lights"): NAMES,
+    ("run", "--degree"): [*WORDS, "-1", "2", HUGE],
+    ("run", "--texels"): [*WORDS, "-1", "0", "8", HUGE],
+    ("run", "--signed"): FLAG,
     ("run", "--set"): [*NAMES, "=", ".", ".=", "sampler.=1", "sampler.nonsense=1", "nonsense.count=1"],
     ("run", "--error"): [*NUMBERS, "-1", "0", "1", HUGE],
     ("run", "--seconds"): [*NUMBERS, "-1", "0"],
