@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from illumgrid.field.scene import Field, Material, Scene, box_around
+from illumgrid.field.scene import Field, Material, Scene, box_around, with_texels
 from illumgrid.field.volume import Floats, Volume
 
 _VOXELS = 64
@@ -42,7 +42,7 @@ def nucleus() -> Scene:
         Field("protons", spread(nucleons(8, 0.0)), protons, limits),
         Field("neutrons", spread(nucleons(9, 1.2)[:8]), neutrons, limits),
     )
-    return Scene(fields, box_around(fields[0].volume))
+    return with_texels(Scene(fields, box_around(fields[0].volume)), 16)  # as many texels as nodes, or fewer
 
 
 @dataclass(frozen=True)
