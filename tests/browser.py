@@ -3,6 +3,7 @@
 import base64
 import io
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +11,10 @@ import pytest
 from PIL import Image
 
 from illumgrid import show as preview
+from illumgrid.field.layers import layers_of
 from illumgrid.field.scene import Field, Material, Scene, box_around, level_table, upright
 from illumgrid.grid import GridSpec, IlluminationGrid, WallTexture
+from illumgrid.grid.channels import channels_of, mixed
 from illumgrid.light import Illumination
 from illumgrid.show.camera import fit_camera
 from illumgrid.show.viewer import page
@@ -49,6 +52,26 @@ def coloured(scene, nodes=9, rows=3):
         shape = (rows, *quad.texels[::-1])
         walls.append(WallTexture(waves(*shape), np.ones(shape)))
     return Illumination(scene, level_table(scene, rows), tuple(grids), tuple(walls), {"seed": 0})
+
+
+def apart(scene):
+    """`coloured` light of a scene with several lights, of which it keeps each."""
+    light, layers, channels = coloured(scene), layers_of(scene), channels_of(scene)
+    shares = mixed(channels, layers, {}).mix
+
+    def parts(values):
+        """All together, then the layers, equally bright, each with a gradient of its own."""
+        held, along = [], np.linspace(0.2, 1.8, values.shape[0])[:, None, None]
+        for name, share in zip(channels.names[channels.own :], shares[channels.own :]):
+            bright = along if name.startswith(layers[0].name) else 2 - along
+            held.append(bright * values[..., "YRGB".index(name[-1]) % 3] / len(layers) / max(share))
+        held = np.stack(held, axis=-1)
+        together = held @ np.array(shares[channels.own :])
+        return np.concatenate([together[..., : channels.own], held], axis=-1)
+
+    grids = [replace(g, values=parts(g.light), channels=channels) for g in light.grids]
+    walls = [replace(w, values=parts(w.light), channels=channels) for w in light.walls]
+    return replace(light, grids=tuple(grids), walls=tuple(walls))
 
 
 def bent(n=(22, 17, 25)):
@@ -146,12 +169,13 @@ def decoded(file):
     return np.asarray(Image.open(io.BytesIO(file)).convert("RGB")).astype(int)
 
 
-def still(light, t, local=False):
+def still(light, t, **options):
     """The software picture at a position of the sweep, the page's address for the same view, and the object's mask."""
     scene = light.scene
     row = scene.levels(t)[0]
     camera = fit_camera(scene, row, WIDTH / HEIGHT)
-    made = preview.render(light, isovalue=row[0], width=WIDTH, height=HEIGHT, local=local, camera=camera).astype(int)
+    options |= {"width": WIDTH, "height": HEIGHT, "camera": camera}
+    made = preview.render(light, isovalue=row[0], **options).astype(int)
     address = f"isovalue={float(row[0])!r}&view={camera_state(scene, camera)}"
     return made, address, (made != made[0, 0]).any(axis=2)
 

@@ -2,11 +2,13 @@
 
 import base64
 import builtins
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from browser import browser, coloured, pair  # noqa: F401
+from browser import apart, browser, coloured, pair  # noqa: F401
+from illumgrid.field.lights import Distant
 from illumgrid.show.viewer.widget import _widget_class
 from shapes import lit, refused, sky
 
@@ -43,10 +45,10 @@ def test_a_notebook_shows_a_picture_and_a_view_whose_isovalue_can_be_set(request
     assert book.cells[3].outputs[0].text == "[3000.0] (2100.0, 3000.0)\n"
 
 
-def test_the_view_follows_the_model_and_leads_it(browser):  # noqa: F811
-    pytest.importorskip("anywidget")
-    view = coloured(pair()).show(isovalue=2400)
-    traits = {name: getattr(view, name) for name in ("isovalue", "height", "_scene", "_shaders", "_style", "_markup")}
+def shown(browser, view):  # noqa: F811
+    """A page that shows the view, led by a model that stands for a notebook's; and a list of what goes wrong in it."""
+    names = ("isovalue", "weights", "height", "_scene", "_shaders", "_style", "_markup")
+    traits = {name: getattr(view, name) for name in names}
     page = browser.context.new_page()
     troubles = []
     page.on("pageerror", lambda error: troubles.append(str(error)))
@@ -57,11 +59,17 @@ def test_the_view_follows_the_model_and_leads_it(browser):  # noqa: F811
         globalThis.model = { get: (k) => traits[k], set: (k, v) => { traits[k] = v },
             save_changes: () => { model.saved = traits.isovalue },
             on: (k, f) => { heard[k] = f }, off: () => {},
-            lead: (v) => { traits.isovalue = v; heard['change:isovalue']() } };
+            lead: (v, k = 'isovalue') => { traits[k] = v; heard[`change:${k}`]() } };
         const module = await import(URL.createObjectURL(new Blob([script], { type: 'text/javascript' })));
         await module.default.render({ model, el: document.getElementById('here') });
     }"""
     page.evaluate(lead, [view._esm, traits | {"height": 140}, base64.b64encode(view._data).decode()])
+    return page, troubles
+
+
+def test_the_view_follows_the_model_and_leads_it(browser):  # noqa: F811
+    pytest.importorskip("anywidget")
+    page, troubles = shown(browser, coloured(pair()).show(isovalue=2400))
     slider = page.locator('input[type="range"]').first
     assert float(slider.input_value()) == pytest.approx(2400)
     page.evaluate("model.lead(2850)")
@@ -69,6 +77,30 @@ def test_the_view_follows_the_model_and_leads_it(browser):  # noqa: F811
     slider.evaluate("e => { e.value = 2500; e.dispatchEvent(new Event('input', { bubbles: true })) }")
     assert page.evaluate("model.saved") == pytest.approx(2500)
     assert "isovalue" not in page.url and not troubles
+    page.close()
+
+
+def test_weights_of_lights_lead_the_view_and_follow_it(browser):  # noqa: F811
+    traitlets = pytest.importorskip("traitlets")
+    pytest.importorskip("anywidget")
+    view = apart(replace(pair(), lights=(Distant("key", (-1, -1, 1), 25, (3, 2, 1)),))).show(isovalue=2400)
+    lamp, key = sorted(view.weights, key="key".__eq__)
+    assert view.weights == {lamp: 1.0, "key": 1.0} and key == "key"
+    view.weights = {"key": 2.0}  # the other keeps its weight
+    assert view.weights == {lamp: 1.0, "key": 2.0}
+    for wrong in ({"kye": 1.0}, {"key": np.inf}):
+        with pytest.raises(traitlets.TraitError, match=r"expected a finite number for .*key"):
+            view.weights = wrong
+    page, troubles = shown(browser, view)
+    sliders = page.locator('[data-part="lights"] input')
+    numbers = [float(s.input_value()) for s in sliders.all()]
+    assert numbers == [view.weights[name] for name in view.lights] and 2.0 in numbers
+    assert float(page.locator('input[type="range"]').first.input_value()) == pytest.approx(2400)
+    page.evaluate("w => model.lead(w, 'weights')", {lamp: 0.5, "key": 1.5})
+    assert sorted(float(s.input_value()) for s in sliders.all()) == [0.5, 1.5]
+    at = view.lights.index("key")
+    sliders.nth(at).evaluate("e => { e.value = 0.25; e.dispatchEvent(new Event('input', { bubbles: true })) }")
+    assert page.evaluate("model.get('weights')") == {lamp: 0.5, "key": 0.25} and not troubles
     page.close()
 
 

@@ -5,13 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from browser import HEIGHT, WIDTH, bent, browser, coloured, decoded, pair, still, until  # noqa: F401
+from browser import HEIGHT, WIDTH, apart, bent, browser, coloured, decoded, pair, still, until  # noqa: F401
+from illumgrid.field.lights import Distant
+from illumgrid.field.scene import Material
 from illumgrid.show import BACKGROUND, fit_camera
 from illumgrid.show.engines import software
 from illumgrid.show.shade import Shown, opaque
 from illumgrid.tone import decode_srgb
 
 pytestmark = pytest.mark.filterwarnings("default")  # of the browser's driver
+KEY = Distant("key", (-1, -1, 1), 25, (3.0, 2.0, 1.0))
 SCENES = {"bent": coloured(bent()), "pair": coloured(pair())}
 
 
@@ -32,6 +35,45 @@ def test_the_pixels_are_those_of_the_still_picture(browser, name, t, kind):  # n
     # Half floats are good to 0.1 of 255; what is left are outlines, which the page samples up to four times as densely.
     assert np.median(off[covered]) <= 1 and np.quantile(off[covered], 0.9) <= 3
     assert np.mean(off[~covered] > 3) < 0.02
+
+
+def grey_under_a_key():
+    """Grey surfaces: each layer is one channel, and its colour that of its light."""
+    (field,) = bent().fields
+    return replace(bent(), fields=(replace(field, name="grey", material=Material((0.7, 0.7, 0.7))),), lights=(KEY,))
+
+
+def dark_room_with_a_key():
+    one, other = pair().fields
+    return replace(pair(), fields=(replace(one, name="room"), other), lights=(KEY,))
+
+
+@pytest.mark.parametrize("scene", [grey_under_a_key, dark_room_with_a_key])
+def test_sliders_mix_the_lights_at_the_exposure_of_the_first_picture(browser, scene):  # noqa: F811
+    baked = apart(scene())
+    kept = baked.mix(**{baked.lights[0]: 0.8})  # opens at weights of its own
+    wanted, address, covered = still(kept, 0.1)
+    page = browser.open(kept, address)
+    off = np.abs(browser.pixels() - wanted).max(axis=2)[covered]
+    assert np.median(off) <= 1 and np.quantile(off, 0.9) <= 3
+    weights = dict(zip(baked.lights, (0.2, 1.6)))
+    sliders = page.locator('[data-part="lights"] input')
+    assert [float(s.input_value()) for s in sliders.all()] == [0.8, 1.0] and "weights" not in page.url
+    for slider, weight in zip(sliders.all(), weights.values()):
+        slider.evaluate("(e, w) => { e.value = w; e.dispatchEvent(new Event('input', { bubbles: true })) }", weight)
+    mixed = kept.mix(**weights)
+    moved, _, _ = still(mixed, 0.1, stops=np.log2(kept.exposure / mixed.exposure))
+    assert np.median(np.abs(moved - wanted).max(axis=2)[covered]) > 10
+    off = np.abs(browser.pixels() - moved).max(axis=2)[covered]
+    assert np.median(off) <= 1 and np.quantile(off, 0.9) <= 3
+    assert page.url.endswith("weights=0.2,1.6")
+    browser.open(kept, page.url.partition("#")[2], anew=True)
+    off = np.abs(browser.pixels() - moved).max(axis=2)[covered]
+    assert np.median(off) <= 1 and np.quantile(off, 0.9) <= 3
+
+
+def test_a_run_of_one_light_has_no_slider_for_it(browser):  # noqa: F811
+    assert browser.open(SCENES["bent"]).locator('[data-part="lights"] input').count() == 0
 
 
 def test_the_page_opens_at_the_middle_with_the_camera_of_the_still_picture(browser):  # noqa: F811

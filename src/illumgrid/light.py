@@ -170,7 +170,7 @@ class Illumination:
         Returns
         -------
         anywidget.AnyWidget
-            ``ipywidgets`` can observe and link its trait ``isovalue``.
+            ``ipywidgets`` can observe and link its traits ``isovalue`` and ``weights``, by light.
 
         Raises
         ------

@@ -15,7 +15,7 @@ from typing import Any
 
 from illumgrid.light import Illumination
 
-MODULES = ("numbers", "camera", "state", "sweeps", "input", "picture", "view")  # each imports from those before it
+MODULES = ("numbers", "camera", "state", "sweeps", "lights", "input", "picture", "view")  # each imports from earlier
 SHADERS = ("shared.glsl", "ray.vert", "field.frag", "wall.vert", "wall.frag", "copy.frag")
 
 
@@ -26,9 +26,9 @@ def source(name: str) -> str:
 
 
 def script(last: str) -> str:
-    """The modules and `last` joined into one: names are unique, so imports and exports between them are dropped."""
+    """The modules and `last` joined into one: names are unique, so imports and exports are dropped, as comments are."""
     joined = "\n".join(source(f"{name}.js") for name in (*MODULES, last))
-    joined = re.sub(r"^import .*\n", "", joined, flags=re.MULTILINE)
+    joined = re.sub(r"^(import | *//).*\n", "", joined, flags=re.MULTILINE)
     return re.sub(r"^export (?!default)", "", joined, flags=re.MULTILINE)
 
 

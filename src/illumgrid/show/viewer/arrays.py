@@ -1,12 +1,15 @@
 """The arrays of a page as one run of bytes: field values in whole steps, light in half floats."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from illumgrid.field.layers import Layer
 from illumgrid.field.volume import Volume, index_to_world
 from illumgrid.grid import GridSpec, IlluminationGrid
+from illumgrid.grid.channels import Channels, mixed
 
 MOST_SIDE = 2048
 """Voxels along one side of a texture: what graphics drivers of phones and laptops take."""
@@ -91,6 +94,11 @@ def _planes(words: NDArray[np.uint16]) -> bytes:
     return (words & 0xFF).astype(np.uint8).tobytes() + (words >> 8).astype(np.uint8).tobytes()
 
 
+def _half(values: NDArray[np.floating]) -> NDArray[np.uint16]:
+    half: NDArray[np.uint16] = np.clip(values, -65504, 65504).astype(np.float16).view(np.uint16)
+    return half
+
+
 def pack_values(steps: NDArray[Any], into: Bytes) -> dict[str, Any]:
     """Field values (nx, ny, nz) as differences along x."""
     x_fastest = np.ascontiguousarray(steps.transpose(2, 1, 0))
@@ -102,7 +110,24 @@ def pack_values(steps: NDArray[Any], into: Bytes) -> dict[str, Any]:
 def pack_light(light: NDArray[np.floating], error: NDArray[np.floating], into: Bytes) -> dict[str, Any]:
     """Light (nx, ny, nz, C), grey or RGB, and its error (nx, ny, nz) as half floats, x fastest."""
     texels = np.concatenate([light, error[..., None]], axis=3).transpose(3, 2, 1, 0)
-    half = np.clip(texels, -65504, 65504).astype(np.float16).view(np.uint16).reshape(len(texels), -1)
+    half = _half(texels).reshape(len(texels), -1)
     half[1:-1] -= half[0]  # channels are similar: the differences compress well
     data = b"".join(_planes(channel) for channel in half)
     return {"shape": list(light.shape[:3]), "channels": light.shape[3], "offset": into.add(data)}
+
+
+def pack_layers(
+    light: NDArray[np.floating], channels: Channels, layers: Sequence[Layer], colors: int, into: Bytes
+) -> list[dict[str, Any]]:
+    """The channels of light (nx, ny, nz, C) that hold one of several lights, as half floats, x fastest.
+
+    Each with the number of its light, and what it adds to the `colors` colours (1 or 3) where that light weighs 1.
+    """
+    names, packed = [layer.name for layer in layers], []
+    for name, row, values in zip(channels.names, mixed(channels, layers, {}).mix, np.moveaxis(light, -1, 0)):
+        if layer := name.rpartition(".")[0]:
+            peak = max(row)  # half floats reach as far as the picture needs, however bright a light is
+            data = _planes(_half(values.T * peak).ravel())
+            color = [share / peak for share in row[:colors]]
+            packed.append({"light": names.index(layer), "color": color, "offset": into.add(data)})
+    return packed

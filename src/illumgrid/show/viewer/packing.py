@@ -8,8 +8,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from illumgrid.errors import shown_range
+from illumgrid.field.layers import layers_of
 from illumgrid.field.levelset import turned
 from illumgrid.field.scene import Field, Scene
 from illumgrid.field.upright import axes_of, up_of
@@ -18,7 +20,16 @@ from illumgrid.light import Illumination
 from illumgrid.show import trust
 from illumgrid.show.camera import HALF_ANGLE, fit_camera, outline_of
 from illumgrid.show.shade import BACKGROUND, CAP_TONE
-from illumgrid.show.viewer.arrays import HOLE, Bytes, field_steps, pack_light, pack_values, reduced, thinned
+from illumgrid.show.viewer.arrays import (
+    HOLE,
+    Bytes,
+    field_steps,
+    pack_layers,
+    pack_light,
+    pack_values,
+    reduced,
+    thinned,
+)
 from illumgrid.tone import WHITE, encode_srgb
 
 MOST_VOXELS = 2**25
@@ -65,6 +76,13 @@ def _histogram(field: Field) -> dict[str, Any]:
     return {"counts": counts.tolist(), "limits": field.volume.in_units([float(low), float(high)]).tolist()}
 
 
+def kept_apart(light: Illumination) -> dict[str, float]:
+    """Weights of the lights by name, if grids and walls keep several lights that can be weighed anew, else none."""
+    held = [*(grid.channels for grid in light.grids), *(wall.channels for wall in light.walls)]
+    apart = all(channels.mixable and "." in channels.names[-1] for channels in held)
+    return {name: float(light.weights.get(name, 1.0)) for name in light.lights} if apart else {}
+
+
 def _field(light: Illumination, number: int, stage: Stage, into: Bytes, notes: list[str]) -> dict[str, Any]:
     field, whole = light.scene.fields[number], light.grids[number]
     volume, grid = reduced(field.volume, MOST_VOXELS), thinned(whole, MOST_NODES)
@@ -79,7 +97,11 @@ def _field(light: Illumination, number: int, stage: Stage, into: Bytes, notes: l
     texture[:3, 3] = 0.5 / np.array(grid.spec.shape)
     albedo = field.material.albedo
     error = np.where(np.isfinite(grid.bar), trust.relative(whole, grid.bar), HOLE)
-    shown = grid.channels.shown(grid.light)
+    scale = light.exposure / np.pi
+    shown = pack_light(grid.channels.shown(grid.light) * scale, error, into)
+    if kept_apart(light):
+        layers = layers_of(light.scene)
+        shown["layers"] = pack_layers(grid.light * scale, grid.channels, layers, shown["channels"], into)
     return {
         "name": field.name,
         "range": field.range.tolist(),
@@ -90,7 +112,7 @@ def _field(light: Illumination, number: int, stage: Stage, into: Bytes, notes: l
         "histogram": _histogram(field),
         "values": pack_values(steps, into)
         | {"base": base * field.volume.slope + sign * field.volume.intercept, "step": step * field.volume.slope},
-        "light": pack_light(shown * (light.exposure / np.pi), error, into),
+        "light": shown,
         "toIndex": stage.to_index(volume).T.ravel().tolist(),
         "toTexture": (texture @ stage.to_index(grid.spec)).T.ravel().tolist(),
     }
@@ -108,18 +130,22 @@ def _css(linear: Floats) -> str:
     return "#" + "".join(f"{int(c):02x}" for c in encode_srgb(linear))
 
 
+def _beside(walls: list[NDArray[np.float32]]) -> NDArray[np.float32]:
+    """Textures (K, nv, nu, C) of walls side by side in one (u, v, sweep, C)."""
+    high = max(wall.shape[1] for wall in walls)
+    padded = [np.pad(wall, [(0, 0), (0, high - wall.shape[1]), (0, 0), (0, 0)]) for wall in walls]
+    return np.concatenate(padded, axis=2).transpose(2, 1, 0, 3)
+
+
 def _walls(light: Illumination, stage: Stage, into: Bytes) -> tuple[list[dict[str, Any]], dict[str, Any] | None]:
     """The quads, and the light of all of them side by side in one texture (u, v, sweep)."""
     quads = light.scene.quads
     if not quads:
         return [], None
-    rows, wide, high = len(light.levels.table), sum(q.texels[0] for q in quads), max(q.texels[1] for q in quads)
     grey = all(wall.channels.grey for wall in light.walls)
-    atlas, offset, described = np.zeros((wide, high, rows, 1 if grey else 3), np.float32), 0, []
-    for quad, wall in zip(quads, light.walls):
+    scale, offset, described = light.exposure / np.pi, 0, []
+    for quad in quads:
         nu, nv = quad.texels
-        lit = wall.channels.shown(wall.light) if grey else wall.values
-        atlas[offset : offset + nu, :nv] = lit.transpose(2, 1, 0, 3) * (light.exposure / np.pi)
         material = quad.material
         described.append(
             {
@@ -135,7 +161,12 @@ def _walls(light: Illumination, stage: Stage, into: Bytes) -> tuple[list[dict[st
             }
         )
         offset += nu
-    return described, pack_light(atlas, np.zeros(atlas.shape[:3]), into)
+    shown = _beside([wall.channels.shown(wall.light) if grey else wall.values for wall in light.walls]) * scale
+    atlas = pack_light(shown, np.zeros(shown.shape[:3]), into)
+    if kept_apart(light):
+        layers, channels = _beside([wall.light for wall in light.walls]) * scale, light.walls[0].channels
+        atlas["layers"] = pack_layers(layers, channels, layers_of(light.scene), atlas["channels"], into)
+    return described, atlas
 
 
 def _opening(scene: Scene, stage: Stage, up: str | None) -> dict[str, Any]:
@@ -189,6 +220,7 @@ def packed(light: Illumination, up: str | None = None) -> tuple[dict[str, Any], 
             "hatch": trust.HATCH.tolist(),
             "colors": [_css(color) for color in _between(trust.SCALE.astype(float))],
         },
+        "lights": [{"name": name, "weight": weight} for name, weight in kept_apart(light).items()],
         "fields": fields,
         "walls": walls,
         "atlas": atlas,

@@ -22,11 +22,13 @@ def _widget_class() -> type[Any]:
         ) from reason
 
     class View(anywidget.AnyWidget):  # type: ignore[misc, unused-ignore]
-        """A view of a lit scene; `isovalue`, of the first field, follows the slider and sets it."""
+        """A lit scene; `isovalue`, of the first field, and `weights`, by light, follow the sliders and set them."""
 
         _esm = script("widget")
         isovalue = traitlets.Float().tag(sync=True)
         range = traitlets.Tuple(traitlets.Float(), traitlets.Float(), read_only=True)
+        lights = traitlets.Tuple(read_only=True)
+        weights = traitlets.Dict(value_trait=traitlets.Float()).tag(sync=True)
         height = traitlets.Int(520).tag(sync=True)
         _scene = traitlets.Unicode().tag(sync=True)
         _shaders = traitlets.Unicode().tag(sync=True)
@@ -40,6 +42,14 @@ def _widget_class() -> type[Any]:
                 raise traitlets.TraitError(f"the isovalue is {proposal['value']}; expected a finite number")
             return float(np.clip(proposal["value"], *self.range))
 
+        @traitlets.validate("weights")
+        def _of_known_lights(self, proposal: Any) -> dict[str, float]:
+            for name, weight in proposal["value"].items():
+                if name not in self.lights or not np.isfinite(weight):
+                    known = ", ".join(self.lights) or "none, for this run keeps no lights apart"
+                    raise traitlets.TraitError(f"light {name!r} weighs {weight}; expected a finite number for {known}")
+            return {**self.weights, **proposal["value"]}
+
     return View
 
 
@@ -48,7 +58,7 @@ def widget(light: Illumination, isovalue: float | None = None, height: int = 520
     import json
 
     view = _widget_class()
-    from illumgrid.show.viewer.packing import packed
+    from illumgrid.show.viewer.packing import kept_apart, packed
 
     scene, data = packed(light)
     low, high = map(float, light.scene.fields[0].range)
@@ -61,5 +71,7 @@ def widget(light: Illumination, isovalue: float | None = None, height: int = 520
         _data=compressed(data),
     )
     made.set_trait("range", (low, high))
+    made.set_trait("lights", tuple(kept_apart(light)))
+    made.weights = kept_apart(light)
     made.isovalue = (low + high) / 2 if isovalue is None else isovalue
     return made

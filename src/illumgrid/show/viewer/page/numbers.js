@@ -48,6 +48,24 @@ export function lightTexels(bytes, about) {
   return texels;
 }
 
+const HALVES = Float32Array.from({ length: 65536 }, (_, h) => {
+  const power = (h >> 10) & 31, size = power ? (1024 + (h & 1023)) * 2 ** (power - 25) : (h & 1023) * 2 ** -24;
+  return h & 32768 ? -size : size;
+});
+
+// The same texels in single precision, the light mixed from its layers: their sum is clamped, not each of them.
+export function mixedTexels(bytes, about, weights) {
+  const count = about.shape[0] * about.shape[1] * about.shape[2], each = about.channels + 1;
+  const texels = new Float32Array(each * count);
+  const add = (offset, k, share) => {
+    if (share) for (let i = 0; i < count; i++) texels[each * i + k] += share * HALVES[bytes[offset + i] | (bytes[offset + count + i] << 8)];
+  };
+  for (const { light, color, offset } of about.layers) color.forEach((share, k) => add(offset, k, share * weights[light]));
+  for (let i = 0; i < texels.length; i++) texels[i] = Math.max(0, Math.min(65504, texels[i]));
+  add(about.offset + 2 * count * about.channels, about.channels, 1); // the error, whose holes are negative
+  return texels;
+}
+
 // Least and largest value over the 5³ voxels of each brick: rays jump over bricks that no level set crosses.
 export function bricks(values, [nx, ny, nz]) {
   const shape = [nx, ny, nz].map((n) => Math.ceil((n - 1) / BRICK));

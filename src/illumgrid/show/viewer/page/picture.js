@@ -1,6 +1,6 @@
 // Draws one picture: layers of fields and walls, summed over places within the pixel, then shown.
 
-import { bricks, fieldValues, lightTexels } from "./numbers.js";
+import { bricks, fieldValues, lightTexels, mixedTexels } from "./numbers.js";
 import { dot, eyeOf, facing, sum } from "./camera.js";
 import { isovalueOf } from "./state.js";
 
@@ -74,6 +74,7 @@ export class Picture {
     });
     this.walls = scene.atlas ? this.light(scene.atlas, data) : null;
     this.size = [0, 0];
+    if (scene.lights.length) Object.assign(this, { data, weights: String(scene.lights.map((light) => light.weight)) });
   }
 
   volume(format, layout, type, [nx, ny, nz], values, filter) {
@@ -90,6 +91,17 @@ export class Picture {
   light(about, data) {
     const gl = this.gl, [format, layout] = about.channels === 1 ? [gl.RG16F, gl.RG] : [gl.RGBA16F, gl.RGBA];
     return this.volume(format, layout, gl.HALF_FLOAT, about.shape, lightTexels(data, about), gl.LINEAR);
+  }
+
+  // Light of fields and walls under other weights; until they change, it is the stored one.
+  mix(weights) {
+    if (!this.data || this.weights === String(weights)) return;
+    this.weights = String(weights);
+    const gl = this.gl, lit = this.scene.fields.map((field, k) => [this.fields[k].light, field.light]);
+    for (const [texture, about] of this.walls ? [...lit, [this.walls, this.scene.atlas]] : lit) {
+      gl.bindTexture(gl.TEXTURE_3D, texture);
+      gl.texSubImage3D(gl.TEXTURE_3D, 0, 0, 0, 0, ...about.shape, about.channels === 1 ? gl.RG : gl.RGBA, gl.FLOAT, mixedTexels(this.data, about, weights));
+    }
   }
 
   // A place to draw into: half-float colour, and a depth that can be read back.

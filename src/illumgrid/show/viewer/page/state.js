@@ -19,6 +19,7 @@ export function written(state, scene) {
   if (state.look !== DEFAULTS.look) parts.push(`look=${state.look}`);
   if (state.stops) parts.push(`stops=${short(state.stops)}`);
   if (state.trust) parts.push("trust=1");
+  if (scene.lights.some(({ weight }, k) => weight !== state.weights[k])) parts.push(`weights=${state.weights.map(short).join(",")}`);
   return parts.join("&");
 }
 
@@ -31,6 +32,8 @@ export function read(address, scene, looks) {
   if (view.length === 6 && view.every(Number.isFinite) && view[2] > 0) {
     state.view = { azimuth: view[0], elevation: clamp(view[1], -1.5533, 1.5533), distance: view[2], target: view.slice(3), moved: true };
   }
+  const weights = (given.get("weights") ?? "").split(",").map(Number);
+  if (given.get("weights") && weights.length === scene.lights.length && weights.every(Number.isFinite)) state.weights = weights;
   if (["global", "local", "both"].includes(given.get("light"))) state.light = given.get("light");
   if (looks.includes(given.get("look"))) state.look = given.get("look");
   if (number("split") !== null) state.split = clamp(number("split"), 0, 1);

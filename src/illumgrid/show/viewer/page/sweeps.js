@@ -20,7 +20,7 @@ function bars(counts, from, to, highest) {
   return path;
 }
 
-function element(kind, attributes = {}, children = []) {
+export function element(kind, attributes = {}, children = []) {
   const made = document.createElement(kind);
   for (const [name, value] of Object.entries(attributes)) made.setAttribute(name, value);
   made.append(...children);

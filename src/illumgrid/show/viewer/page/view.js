@@ -2,6 +2,7 @@
 
 import { fitted } from "./camera.js";
 import { listen, listenSplit } from "./input.js";
+import { lights } from "./lights.js";
 import { LOOKS, Picture } from "./picture.js";
 import { DEFAULTS, clamp, isovalueOf, read, written } from "./state.js";
 import { formatted, sweeps } from "./sweeps.js";
@@ -20,7 +21,7 @@ export function view(root, scene, data, shaders, { address = true, onChange = ()
   const part = (name) => root.querySelector(`[data-part="${name}"]`);
   const canvas = part("canvas"), stage = part("stage");
   const picture = new Picture(canvas, scene, data, shaders);
-  const state = { ...DEFAULTS };
+  const opened = { ...DEFAULTS, weights: scene.lights.map((light) => light.weight) }, state = { ...opened };
   let changed = -Infinity, samples = 0, coarse = 2, asked = false, written_ = "", fresh = true;
 
   const aspect = () => Math.max(stage.clientWidth, 1) / Math.max(stage.clientHeight, 1);
@@ -28,9 +29,12 @@ export function view(root, scene, data, shaders, { address = true, onChange = ()
   state.view = whole();
 
   const show = sweeps(part("sweeps"), scene.fields, (sweep) => put({ sweep }));
+  const weigh = lights(part("lights"), scene.lights, () => state.weights, (weights) => put({ weights }));
 
   function controls() {
     show(state.sweep);
+    weigh(state.weights);
+    part("opened").hidden = String(state.weights) === String(opened.weights);
     for (const choice of root.querySelectorAll("[data-choice]")) {
       const kind = choice.dataset.choice;
       for (const input of choice.querySelectorAll("input")) input.checked = input.value === state[kind];
@@ -78,6 +82,7 @@ export function view(root, scene, data, shaders, { address = true, onChange = ()
   function frame() {
     asked = false;
     size();
+    picture.mix(state.weights);
     const moving = !fresh && performance.now() - changed < REST;
     const begun = performance.now(), divide = moving ? coarse : 1;
     picture.sample(state, Math.ceil(canvas.width / divide), Math.ceil(canvas.height / divide), moving ? [0.5, 0.5] : PLACES[samples], moving ? 0 : samples);
@@ -107,7 +112,7 @@ export function view(root, scene, data, shaders, { address = true, onChange = ()
   }
 
   function follow() {
-    if (location.hash.slice(1) !== written_) put({ ...DEFAULTS, view: whole(), ...read(location.hash.slice(1), scene, LOOKS) });
+    if (location.hash.slice(1) !== written_) put({ ...opened, view: whole(), ...read(location.hash.slice(1), scene, LOOKS) });
   }
 
   function save() {

@@ -15,21 +15,24 @@ async function render({ model, el }) {
     const data = await inflate(new Uint8Array(held.buffer, held.byteOffset, held.byteLength));
     const [low, high] = scene.fields[0].range;
     const isovalue = (sweep) => isovalueOf(scene.fields[0], sweep);
+    const given = () => scene.lights.map(({ name, weight }) => model.get("weights")[name] ?? weight);
     const near = (a, b) => Math.abs(a - b) < 1e-9 * (high - low);
+    const agree = (state) => near(model.get("isovalue"), isovalue(state.sweep)) && String(given()) === String(state.weights);
     const shown = view(root, scene, data, JSON.parse(model.get("_shaders")), {
       address: false,
       onChange: (state) => {
-        if (near(model.get("isovalue"), isovalue(state.sweep))) return;
-        model.set("isovalue", isovalue(state.sweep));
+        if (agree(state)) return;
+        if (!near(model.get("isovalue"), isovalue(state.sweep))) model.set("isovalue", isovalue(state.sweep));
+        if (String(given()) !== String(state.weights)) model.set("weights", Object.fromEntries(scene.lights.map(({ name }, k) => [name, state.weights[k]])));
         model.save_changes();
       },
     });
     const follow = () => {
-      if (!near(model.get("isovalue"), isovalue(shown.state.sweep))) shown.put({ sweep: sweepOf(scene.fields[0], model.get("isovalue")) });
+      if (!agree(shown.state)) shown.put({ sweep: sweepOf(scene.fields[0], model.get("isovalue")), weights: given() });
     };
-    model.on("change:isovalue", follow);
+    for (const trait of ["isovalue", "weights"]) model.on(`change:${trait}`, follow);
     follow();
-    return () => model.off("change:isovalue", follow);
+    return () => ["isovalue", "weights"].forEach((trait) => model.off(`change:${trait}`, follow));
   } catch (error) {
     complain(root, error.message);
   }
