@@ -5,7 +5,7 @@ import pytest
 from scipy.ndimage import gaussian_filter, label
 
 from illumgrid.field.boundaries import boundaries, otsu_threshold, suggest_range
-from illumgrid.field.volume import Volume
+from illumgrid.field.volume import Volume, smooth
 
 GRID = np.indices((48, 44, 40)) - np.array([24, 22, 20])[:, None, None, None]
 RADIUS = np.sqrt((GRID**2).sum(axis=0))
@@ -45,6 +45,14 @@ def test_faint_and_bright_fibres_are_in_the_range():
     whole, fibres = ((volume.values >= at).any(axis=0) for at in (low, middle))
     assert label(whole)[1] == label(fibres)[1] == 10  # the middle still shows all of them
     assert low < middle < high < 0.7 * volume.values.max()
+
+
+def test_blurred_fibres_are_still_fibres():
+    """`run` proposes a blur for rough data: the middle must not leave the faint fibres then."""
+    volume = smooth(neurites(), 1.5)
+    low, high, _ = suggest_range(volume)
+    axes = np.array([volume.values[24, 6 * k + 2, 20 + 3 * (k % 2)] for k in range(10)])
+    assert (axes[1:] > 0.5 * (low + high)).all() and low < axes[0]
 
 
 def test_a_noisy_background_holds_no_boundary():
