@@ -15,8 +15,9 @@ judgements
 defaults
     The default nodes and paths of `run` compared with others, `direct` with `nearest`, on real volumes.
 
-All use a white sky, albedo 0.8, 6 bounces unless the pilot chooses them, and the backend numba. Real volumes are read
-from DIR, by default ../shared/volumes from the repository's root; missing ones are skipped.
+All use a white sky (the floor the light of a studio, the box its lamp), albedo 0.8, 6 bounces unless the pilot chooses
+them, and the backend numba. Real volumes are read from DIR, by default ../shared/volumes from the repository's root;
+missing ones are skipped.
 """
 
 import argparse
