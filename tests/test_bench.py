@@ -351,6 +351,18 @@ def test_the_reference_comes_from_the_packages_own_transport_however_quick_a_plu
     assert references["levelset"].mean > 1.2  # and not the plugin's 1
 
 
+def test_a_backend_that_fails_ends_its_own_race_only(truth, monkeypatch):
+    class Broken(Fake):
+        def solve(self, scene, queries, **how):
+            raise RuntimeError("no licence")
+
+    broken = Broken()
+    found = [("fake", broken, capabilities(broken)), ("numba", BACKEND, capabilities(BACKEND))]
+    monkeypatch.setattr(registry, "backends", lambda: iter(found))
+    entrants, notes = tracers(truth[0], truth[1].queries, 1e6)
+    assert {m.backend.name for m in entrants} == {"numba"} and notes == ["fake does not compete: no licence"]
+
+
 def test_of_fields_of_different_size_the_default_is_what_run_does():
     fields = Field("fine", ball(12), range=(0.5, 0.9)), Field("coarse", ball(6, at=(0.5, 0, 0)), range=(0.5, 0.9))
     scene = Scene(fields, background=np.ones(3))

@@ -348,7 +348,11 @@ def _advise(light: "Illumination", stages: dict[str, Any]) -> None:
     if recipe["reached"] < max(0.05, 1.5 * noise):
         return
     specs = [grid.spec for grid in light.grids]
-    found = remedies(light.scene, stages["backend"], specs, recipe["bounces"], recipe["seed"])
+    try:
+        found = remedies(light.scene, stages["backend"], specs, recipe["bounces"], recipe["seed"])
+    except Exception as reason:  # a finished run is worth more than advice
+        tell("error", f"what would reduce the error could not be measured ({type(reason).__name__}: {reason})")
+        return
     if not found:
         return
     text = f"interpolation between nodes is off by about {found['now']:.1%} at any number of paths"

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from illumgrid import registry
-from illumgrid.errors import BadInput
 from illumgrid.field.scene import Scene
 from illumgrid.stages import Backend, Interpolator
 from illumgrid.transport.samples import Queries
@@ -53,8 +52,8 @@ def tracers(scene: Scene, asked: Queries, budget: float) -> tuple[list[Method], 
             for some in (few[:1], few):  # compiled and built in the first
                 begun = time.perf_counter()
                 tracer.solve(some, paths=range(4), bounces=2, seed=0)
-        except BadInput as reason:
-            notes.append(f"{backend.name} does not compete: {reason}")
+        except Exception as reason:  # a stranger's backend ends its own race only
+            notes.append(f"{backend.name} does not compete: {reason or type(reason).__name__}")
             continue
         spent = (time.perf_counter() - begun) * 64 / len(few)
         own = registry.entry("backend", backend.name).package == "illumgrid"
