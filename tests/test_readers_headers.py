@@ -157,7 +157,8 @@ def test_spaces_become_lps(tmp_path, space, signs):
     index = [(0, 0, 0), (4, 0, 0), (1, 2, 3)]
     there = (np.array([1, 2, 3]) + np.array(index) * [1, 2, 3]) * signs
     assert np.allclose(index_to_world(volume, index), there)
-    assert np.allclose(there, [itk.TransformIndexToPhysicalPoint(i) for i in index])
+    if space != "LAS":  # ITK 5.4 takes the abbreviation for RAS
+        assert np.allclose(there, [itk.TransformIndexToPhysicalPoint(i) for i in index])
 
 
 def test_lists_of_a_nrrd(tmp_path):
