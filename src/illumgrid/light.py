@@ -66,7 +66,7 @@ class Illumination:
         Returns
         -------
         Illumination
-            Exposed anew. Error bars of grids are an upper bound: the sum of |weight| times the error of each light.
+            Exposed anew. Error bars of grids are an upper bound: each light's error times its absolute weight, summed.
 
         Raises
         ------

@@ -74,7 +74,10 @@ class IlluminationGrid:
             raise BadInput(f"the errors of a grid have shape {self.errors.shape}; expected {self.light.shape}")
 
     def showing(self, channels: Channels) -> "IlluminationGrid":
-        """The same grid showing another mix of its layers; its error is an upper bound: Σ |weight| σ."""
+        """The same grid showing another mix of its layers.
+
+        Its error is an upper bound: the sum of each layer's error times the absolute value of its weight.
+        """
         error = np.full(self.error.shape, np.inf, np.float32)
         if self.errors is not None:
             known = np.isfinite(self.errors)  # infinite times 0 is no number
