@@ -28,7 +28,7 @@ def installed(tmp_path, monkeypatch):
     plugins = [name for name in MODULES if not name.startswith("test_")]
     (about / "entry_points.txt").write_text("[illumgrid]\n" + "\n".join(f"{name} = {name}" for name in plugins))
     for name, code in MODULES.items():
-        (tmp_path / f"{name}.py").write_text(code)
+        (tmp_path / f"{name}.py").write_text(code, "utf-8")
         monkeypatch.delitem(sys.modules, name, raising=False)
     registry._registry.cache_clear()
     yield
