@@ -87,7 +87,7 @@ def plateaus(volume: Volume) -> list[tuple[float, float, Floats]]:
 def turning(volume: Volume, low: float, high: float) -> float:
     """How much the normal turns from voxel to voxel on level sets of a range of stored values: its RMS, 2 sin(angle/2).
 
-    It is what a grid of one node a voxel has to resolve: 0.1 on smooth fields, 0.8 on raw magnetic resonance images,
+    It is what a grid of one node per voxel has to resolve: 0.1 on smooth fields, 0.8 on raw magnetic resonance images,
     1.4 where neighbouring normals have nothing to do with each other. 0 where the range has no voxels.
     """
     v = volume.values
