@@ -89,7 +89,7 @@ def measure(voxels, engine, rounds):
     return {
         "vertices": len(points),
         "extraction ms": 1e3 * float(np.median(extraction)),
-        "thereof scikit-image and trimesh ms": 1e3 * float(np.median(times["isosurface"])),
+        "of which scikit-image and trimesh ms": 1e3 * float(np.median(times["isosurface"])),
         "lookup ms": 1e3 * float(np.median(times["lookup and exposure"])),
         "tone ms": 1e3 * float(np.median(times["tone"])),
         "drawing ms": 1e3 * float(np.median(drawing)),

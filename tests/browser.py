@@ -54,7 +54,7 @@ def coloured(scene, nodes=9, rows=3):
     return Illumination(scene, level_table(scene, rows), tuple(grids), tuple(walls), {"seed": 0})
 
 
-def apart(scene):
+def with_separate_lights(scene):
     """`coloured` light of a scene with several lights, of which it keeps each."""
     light, layers, channels = coloured(scene), layers_of(scene), channels_of(scene)
     shares = mixed(channels, layers, {}).mix

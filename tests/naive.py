@@ -586,8 +586,8 @@ def spread(worth, first, sky, lamps):
     while sum(map(len, nets)) < count:
         at = sum(map(len, nets))
         nets.append(worth[at : at + net_size(first + at, count - at)])
-    told = [net for net in nets if len(net) > 1] or ([worth] if count == 2 else [])
-    per_path = sum(len(net) * net_variance(net) for net in told) / max(1, sum(map(len, told)))
+    known = [net for net in nets if len(net) > 1] or ([worth] if count == 2 else [])
+    per_path = sum(len(net) * net_variance(net) for net in known) / max(1, sum(map(len, known)))
     usual = max(sum(worth) / count, sky)
     one_more = math.hypot(0.2 * usual, max(worth) - min(usual, max(worth)), lamps)
     return count * (count - 1) * (per_path / count + (one_more / count) ** 2)

@@ -29,32 +29,32 @@ def test_level_sets_of_a_linear_field_are_as_far_apart_as_its_slope_says(slope, 
     volume = sampled(lambda x: scale * (x @ np.array(slope)), (12, 9, 8), spacing=UNEVEN, direction=MIRRORED)
     low, high = np.percentile(volume.values, [20, 80])
     edges = np.linspace(low, high, 33)
-    apart = distance_between(field_of(volume, (low, high)), edges)
-    np.testing.assert_allclose(apart, np.diff(edges) / (scale * np.linalg.norm(slope)), rtol=1e-4)
+    distance = distance_between(field_of(volume, (low, high)), edges)
+    np.testing.assert_allclose(distance, np.diff(edges) / (scale * np.linalg.norm(slope)), rtol=1e-4)
 
 
 def test_level_sets_of_a_paraboloid_come_closer_as_its_slope_grows():
     volume = sampled(lambda x: -(x * x).sum(axis=1), (41, 41, 41), (-10, -10, -10), np.full(3, 0.5))
     edges = np.linspace(-81, -9, 73)
-    apart = distance_between(field_of(volume, (-81, -9)), edges)
-    np.testing.assert_allclose(apart, -np.diff(np.sqrt(-edges)), rtol=0.01)
+    distance = distance_between(field_of(volume, (-81, -9)), edges)
+    np.testing.assert_allclose(distance, -np.diff(np.sqrt(-edges)), rtol=0.01)
 
 
 def test_whole_numbers_leave_no_comb():
     fine = sampled(lambda x: 60 - 3 * np.linalg.norm(x, axis=1), (33, 33, 33), (-16, -16, -16))
     edges = np.linspace(20, 50, 301)  # ten bins to a whole number
-    apart = distance_between(field_of(fine.with_values(np.round(fine.values)), (20, 50)), edges)
-    assert np.abs(apart / (0.1 / 3) - 1).max() < 0.15
+    distance = distance_between(field_of(fine.with_values(np.round(fine.values)), (20, 50)), edges)
+    assert np.abs(distance / (0.1 / 3) - 1).max() < 0.15
 
 
 def test_a_plateau_is_no_distance_and_an_empty_part_of_the_range_neither():
     values = np.zeros((30, 4, 4))
     values[10:] = 5  # a step from 0 to 5 within one cell, and two plateaus
     edges = np.linspace(-5, 10, 31)
-    apart = distance_between(field_of(Volume(values), (-5, 10)), edges)
+    distance = distance_between(field_of(Volume(values), (-5, 10)), edges)
     within = (edges[:-1] >= 0) & (edges[1:] <= 5)
-    np.testing.assert_allclose(apart[within], 1 / 10, rtol=1e-9)
-    assert not apart[~within].any()
+    np.testing.assert_allclose(distance[within], 1 / 10, rtol=1e-9)
+    assert not distance[~within].any()
 
 
 @pytest.mark.parametrize("inside", ["above", "below"])

@@ -80,7 +80,7 @@ def test_the_front_is_what_nobody_beats(truth):
 def test_the_errors_of_a_point_have_the_truths_variance_subtracted(truth):
     _, exact = truth
     assert point(exact, 1, 0.1).rmse(exact) == pytest.approx(0.1, rel=1e-6)
-    assert errors(exact.light, exact).rmse == pytest.approx(exact.error / 3)  # less cannot be told from none
+    assert errors(exact.light, exact).rmse == pytest.approx(exact.error / 3)  # less cannot be distinguished from none
 
 
 def test_a_race_goes_from_cheap_to_dear_and_keeps_its_seeds(truth):
@@ -265,7 +265,7 @@ def test_runs_default_is_charted_first_and_goes_on(truth):
     assert default.default and default.built and default.paths == 64
     while contestant := race.next(np.inf):
         race.advance(contestant)
-    assert {p.paths for p in race.points if p.grid == 11} <= {64, 128, 512, 2048}  # no lane starts anew beside it
+    assert {p.paths for p in race.points if p.grid == 11} <= {64, 128, 512, 2048}  # no contestant starts anew beside it
     assert sum(p.paths == 64 for p in race.points) == 1 and {p.grid for p in race.points} == {5, 11}
 
 

@@ -69,8 +69,8 @@ def test_ranges_may_be_negative_and_the_solid_below(call, tmp_path):
 
 
 def test_material_smoothing_seed_and_depth_are_as_told(call, tmp_path):
-    told = "--grid 6 --paths 3 --bounces 2 --seed 9 --albedo 0.1 0.2 0.3 --smooth 1.5 --no-preview -o out"
-    call("run", "v.npy", *RANGE, *told.split())
+    options = "--grid 6 --paths 3 --bounces 2 --seed 9 --albedo 0.1 0.2 0.3 --smooth 1.5 --no-preview -o out"
+    call("run", "v.npy", *RANGE, *options.split())
     made, light = recipe(tmp_path / "out"), ig.load(tmp_path / "out")
     assert {k: made[k] for k in ("grid", "paths", "bounces", "seed", "smooth")} == {
         "grid": 6, "paths": 3, "bounces": 2, "seed": 9, "smooth": 1.5,
@@ -80,17 +80,17 @@ def test_material_smoothing_seed_and_depth_are_as_told(call, tmp_path):
 
 
 def test_options_of_stages_are_set_one_by_one_and_go_before_those_of_the_run(call, tmp_path):
-    told = ("run", "v.npy", *RANGE, *QUICK, "--sampler", "uniform", "--no-preview")
-    call(*told, "--isovalues", "4", "--threads", "1", "-o", "a")
+    options = ("run", "v.npy", *RANGE, *QUICK, "--sampler", "uniform", "--no-preview")
+    call(*options, "--isovalues", "4", "--threads", "1", "-o", "a")
     made = recipe(tmp_path / "a")
     assert made["sampler"] == {"name": "uniform", "count": 4, "points": 0} and made["isovalues"] == 4
     assert made["backend"] == {"name": "numba", "threads": 1, "surface": "auto"}
     own = "--set sampler.count=3 --set sampler.points=100 --set backend.threads=2"
-    call(*told, "--isovalues", "4", "--threads", "1", *own.split(), "-o", "b")
+    call(*options, "--isovalues", "4", "--threads", "1", *own.split(), "-o", "b")
     made = recipe(tmp_path / "b")
     assert made["sampler"] == {"name": "uniform", "count": 3, "points": 100} and made["isovalues"] == 4
     assert made["backend"]["threads"] == 2 and made["queries"] == 300
-    call(*told, "-o", "c")
+    call(*options, "-o", "c")
     assert recipe(tmp_path / "c")["sampler"]["count"] == 32
 
 

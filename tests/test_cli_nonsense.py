@@ -190,13 +190,13 @@ def finished(tmp_path_factory):
 
 
 @pytest.fixture
-def told(finished, capsys, monkeypatch):
+def outcome(finished, capsys, monkeypatch):
     """Exit code, output and new files of a command; the new files are removed again."""
     small = {**preview.render.__kwdefaults__, "width": 24, "height": 18}
     monkeypatch.setattr(preview.render, "__kwdefaults__", small)
     monkeypatch.chdir(finished)
 
-    def told(args):
+    def outcome(args):
         before = set(finished.rglob("*"))
         (finished / "sealed").chmod(0o500)
         try:
@@ -210,7 +210,7 @@ def told(finished, capsys, monkeypatch):
             path.rmdir() if path.is_dir() else path.unlink()
         return code, said, fresh
 
-    return told
+    return outcome
 
 
 def line(command, option, value):
@@ -247,37 +247,37 @@ def test_no_option_is_forgotten():
 
 
 @pytest.mark.parametrize("command, option", REFUSED)
-def test_nonsense_is_refused_in_a_sentence_and_leaves_nothing(told, command, option):
+def test_nonsense_is_refused_in_a_sentence_and_leaves_nothing(outcome, command, option):
     for value in REFUSED[command, option]:
         if "sealed" in value and os.access("/", os.W_OK):
             continue  # nothing is sealed for root
-        code, said, fresh = told(line(command, option, value))
+        code, said, fresh = outcome(line(command, option, value))
         assert code == 2, (value, said)
         one_sentence(said)
         assert not fresh, (value, fresh)
 
 
 @pytest.mark.parametrize("command, option", LEGAL)
-def test_what_is_odd_but_legal_works(told, command, option):
+def test_what_is_odd_but_legal_works(outcome, command, option):
     for value in LEGAL[command, option]:
-        code, said, fresh = told(line(command, option, value))
+        code, said, fresh = outcome(line(command, option, value))
         assert code == 0, (value, said)
         assert fresh or command == "info"
 
 
-def test_an_isosurface_and_one_array_are_refused_their_nonsense(told):
+def test_an_isosurface_and_one_array_are_refused_their_nonsense(outcome):
     for file, option, values in (
         ("x.ply", "--isovalue", [*NUMBERS, "-1", "1e308"]),
         ("x.nrrd", "--array", NAMES),
         ("x.ply", "--on", ["grid", "field"]),
     ):
         for value in values:
-            code, said, fresh = told(["export", "out", file, option, value])
+            code, said, fresh = outcome(["export", "out", file, option, value])
             assert code == 2 and not fresh, (file, value, said)
             one_sentence(said)
 
 
-def test_options_of_stages_are_refused_their_nonsense(told):
+def test_options_of_stages_are_refused_their_nonsense(outcome):
     seen = 0
     for entry in registry.entries():
         if entry.package != "illumgrid" or entry.missing():
@@ -286,7 +286,7 @@ def test_options_of_stages_are_refused_their_nonsense(told):
             for value in [*(NUMBERS if option.type is float else WORDS), "-1", HUGE]:
                 setting = f"{entry.kind}.{option.name}={value}"
                 args = ["run", *BASE["run"].split(), f"--{entry.kind}", entry.name, "--set", setting]
-                code, said, fresh = told(args)
+                code, said, fresh = outcome(args)
                 assert code == 2 and not fresh, (setting, said)
                 one_sentence(said)
                 seen += 1
@@ -294,8 +294,8 @@ def test_options_of_stages_are_refused_their_nonsense(told):
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_an_unknown_option_and_one_argument_too_many_are_refused(told, command):
+def test_an_unknown_option_and_one_argument_too_many_are_refused(outcome, command):
     for more in (["--nonsense"], ["--nonsense", "1"], ["one", "more", "still"]):
-        code, said, fresh = told([command, *BASE[command].split(), *more])
+        code, said, fresh = outcome([command, *BASE[command].split(), *more])
         assert code == 2 and not fresh, said
         one_sentence(said)

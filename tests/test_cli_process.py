@@ -68,7 +68,7 @@ def test_ctrl_c_stops_with_a_sentence_and_leaves_nothing(folder):
             _, said = process.communicate(timeout=30)
         finally:
             process.kill()
-    # what `auto` chose may be told before or after the line waited for
+    # what `auto` chose may be printed before or after the line waited for
     assert process.returncode == 130 and said.splitlines()[-1] == "illumgrid: stopped; nothing was written"
     assert "Traceback" not in said
     assert [p.name for p in folder.iterdir()] == ["v.npy"]

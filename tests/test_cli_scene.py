@@ -94,13 +94,13 @@ def test_a_scene_file_that_is_wrong_is_refused(refuse, corner):
 
 
 def test_bounces_follow_the_scene_and_what_they_leave_out_is_told(call, tmp_path):
-    told = ("run", "v.npy", "--range", "0.3", "0.9", "--albedo", "0.3", "0.3", "0.3", *QUICK)
-    assert "bounces beyond 4 would add" in call(*told, "-o", "open")
-    said = call(*told, "--scene", "box", "-o", "closed")
+    options = ("run", "v.npy", "--range", "0.3", "0.9", "--albedo", "0.3", "0.3", "0.3", *QUICK)
+    assert "bounces beyond 4 would add" in call(*options, "-o", "open")
+    said = call(*options, "--scene", "box", "-o", "closed")
     made = recipe(tmp_path / "closed")
     assert made["bounces"] > 4 and 0 <= made["left_out"] < 0.01
     assert f"bounces beyond {made['bounces']} would add about {made['left_out']:.1%}" in said
-    said = call(*told, "--scene", "box", "--bounces", "0", "-o", "straight")
+    said = call(*options, "--scene", "box", "--bounces", "0", "-o", "straight")
     made = recipe(tmp_path / "straight")
     assert made["bounces"] == 0 and made["left_out"] > 0.1 and f"about {made['left_out']:.1%}" in said
 

@@ -152,10 +152,10 @@ def test_numpy_reads_arrays_and_their_place(tmp_path):
 
 def test_a_field_is_picked_by_name(tmp_path):
     light = lopsided_light(DIRECTIONS["oblique"])
-    told = exports.write(light, tmp_path / "a.vti", field="shell")
+    sentence = exports.write(light, tmp_path / "a.vti", field="shell")
     image = pv.read(tmp_path / "a.vti")
     there = expected(light, vtk_points(image), number=1)
-    assert "'shell'" in told and np.array_equal(image["color"], there["color"])
+    assert "'shell'" in sentence and np.array_equal(image["color"], there["color"])
     assert np.array_equal(image["field"], there["field"])
     refused(lambda: exports.write(light, tmp_path / "a.vti", field="yolk"), "'yolk'", "egg, shell")
 
@@ -179,11 +179,11 @@ def test_many_points_are_looked_up_in_parts_and_progress_is_told(tmp_path, monke
     light = lopsided_light(DIRECTIONS["oblique"])
     exports.write(light, tmp_path / "a.npz", on="field")
     monkeypatch.setattr(exports.arrays, "_AT_ONCE", 50)
-    told = []
-    exports.write(light, tmp_path / "b.npz", on="field", progress=lambda *step: told.append(step))
+    calls = []
+    exports.write(light, tmp_path / "b.npz", on="field", progress=lambda *step: calls.append(step))
     with np.load(tmp_path / "a.npz") as whole, np.load(tmp_path / "b.npz") as parts:
         for name in whole:
             assert np.array_equal(whole[name], parts[name])
     count = 9 * 7 * 6
-    assert told[0] == ("points", 0, count) and told[1] == ("points", 50, count) and ("points", count, count) in told
-    assert told[-1] == ("file", 1, 1)
+    assert calls[0] == ("points", 0, count) and calls[1] == ("points", 50, count) and ("points", count, count) in calls
+    assert calls[-1] == ("file", 1, 1)

@@ -92,7 +92,7 @@ def test_gltf_keeps_its_digits_far_from_the_origin(tmp_path):
 @pytest.mark.parametrize("name", DIRECTIONS)
 def test_trimesh_reads_the_ply_in_the_world_with_srgb_bytes(tmp_path, name):
     light = lopsided_light(DIRECTIONS[name])
-    told = exports.write(light, tmp_path / "a.ply", field="shell", isovalue=-0.7)
+    sentence = exports.write(light, tmp_path / "a.ply", field="shell", isovalue=-0.7)
     mesh = trimesh.load(tmp_path / "a.ply", process=False)
     ours = isosurface(light.scene.fields[1].volume, -0.7, "below")
     assert np.allclose(mesh.vertices, ours.vertices, rtol=1e-6) and np.array_equal(mesh.faces, ours.faces)
@@ -102,7 +102,7 @@ def test_trimesh_reads_the_ply_in_the_world_with_srgb_bytes(tmp_path, name):
         line.split(" ", 2)[1:] for line in head.splitlines() if line.startswith("comment ") and line.count(" ") > 1
     )
     assert comments["field"] == "shell" and comments["isovalue"] == "-0.7" and comments["encoding"] == "sRGB"
-    assert float(comments["exposure"]) == light.exposure and f"{light.exposure:.4g}" in told
+    assert float(comments["exposure"]) == light.exposure and f"{light.exposure:.4g}" in sentence
 
 
 def test_both_files_show_the_same_color(tmp_path):

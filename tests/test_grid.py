@@ -164,9 +164,9 @@ def test_a_hole_takes_the_value_of_the_nearest_supported_node_in_the_world():
     support = (random.random((6, 5, 4)) < 0.2).astype(np.float32)
     filled = fill_holes(spec.spacing, values, support).reshape(-1, 3)
     nodes, good = spec.nodes(), support.ravel() > 0
-    apart = np.linalg.norm(nodes[:, None] - nodes[good][None], axis=2)
+    distance = np.linalg.norm(nodes[:, None] - nodes[good][None], axis=2)
     for node in range(len(nodes)):
-        candidates = values.reshape(-1, 3)[good][apart[node] <= apart[node].min() + 1e-9]
+        candidates = values.reshape(-1, 3)[good][distance[node] <= distance[node].min() + 1e-9]
         assert (candidates == filled[node]).all(axis=1).any()
     assert np.array_equal(filled[good], values.reshape(-1, 3)[good])
 

@@ -180,17 +180,17 @@ def test_a_sampler_without_a_question_makes_a_grid_of_holes():
 
 
 def test_holes_within_the_range_are_a_warning_that_counts_them():
-    with pytest.warns(ig.IllumgridWarning, match=r"\d+ nodes within the range of field 'field' got no light") as heard:
+    with pytest.warns(ig.IllumgridWarning, match=r"\d+ nodes within the range of field 'field' got no light") as caught:
         light = ig.run(sky(ball(16)), sampler=ig.sampler("uniform", count=2, points=4), paths=2, bounces=0)
-    assert len(heard) == 1 and str(light.recipe["holes"][0]) in str(heard[0].message)
+    assert len(caught) == 1 and str(light.recipe["holes"][0]) in str(caught[0].message)
     assert np.isfinite(light.grids[0].values).all() and light.recipe["holes"][0] > 10
 
 
 def test_progress_tells_what_is_done_of_how_much():
-    told = []
-    ig.run(sky(ball(8)), **QUICK, progress=lambda *what: told.append(what))
-    assert told[0][:2] == ("light", 0) and told[-1] == ("grid", 1, 1)
-    done, total = [t for t in told if t[0] == "light"][-1][1:]
+    calls = []
+    ig.run(sky(ball(8)), **QUICK, progress=lambda *what: calls.append(what))
+    assert calls[0][:2] == ("light", 0) and calls[-1] == ("grid", 1, 1)
+    done, total = [t for t in calls if t[0] == "light"][-1][1:]
     assert done == total > 0
 
 

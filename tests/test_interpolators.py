@@ -106,9 +106,9 @@ def test_the_weights_of_rbf_are_those_of_the_textbook():
     random = np.random.default_rng(2)
     for n in (5, 9, 16):
         x = random.uniform(-0.5, 0.5, (n, 3))
-        apart = np.linalg.norm(x[:, None] - x, axis=2)
+        distance = np.linalg.norm(x[:, None] - x, axis=2)
         tail = np.column_stack([np.ones(n), x])
-        system = np.block([[apart, tail], [tail.T, np.zeros((4, 4))]])
+        system = np.block([[distance, tail], [tail.T, np.zeros((4, 4))]])
         right = np.concatenate([np.linalg.norm(x, axis=1), [1, 0, 0, 0]])
         weight = np.zeros(n)
         assert spline.solve_weights(x, 0.0, spline._TAIL, np.zeros((n, n)), np.zeros((n, 2)), weight)
@@ -224,10 +224,10 @@ def test_answers_without_paths_are_passed_over(stage):
 # Sheets that are close
 
 
-def two_faces(apart, facing, per=4):
-    """Light 1 on one sheet and 0 on the other, `apart` nodes from it: the faces of a slab, or walls that face."""
+def two_faces(gap, facing, per=4):
+    """Light 1 on one sheet and 0 on the other, `gap` nodes from it: the faces of a slab, or walls that face."""
     spec = GridSpec((13, 13, 9))
-    lit, dark = sheet(4 + apart / 2, spec, 0, per), sheet(4 - apart / 2, spec, 1, per)
+    lit, dark = sheet(4 + gap / 2, spec, 0, per), sheet(4 - gap / 2, spec, 1, per)
     away = -1.0 if facing else 1.0
     normal = np.zeros((len(lit) + len(dark), 3))
     normal[:, 2] = np.repeat([away, -away], [len(lit), len(dark)])
@@ -247,7 +247,7 @@ def worst_mixture(stage, spec, samples):
 def test_two_faces_one_cell_apart_do_not_mix(stage, facing):
     spec, points, light, normal = two_faces(1.0, facing)
     assert worst_mixture(stage, spec, answers(points, light, normal=normal)) == 0
-    if stage.name != "nearest":  # the normals are what tells them apart
+    if stage.name != "nearest":  # only the normals distinguish them
         assert worst_mixture(stage, spec, answers(points, light)) > 0.05
 
 

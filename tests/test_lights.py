@@ -71,7 +71,7 @@ def test_numpy_and_kernels_agree_under_an_image_and_harmonics():
 # Layers.
 
 
-def lit_apart(**options):
+def in_separate_layers(**options):
     lamps = (
         Quad("one", (0, 0, 30), (9, 0, 0), (0, 9, 0), Material((0, 0, 0), (3, 2, 1))),
         Quad("two", (0, 0, -9), (0, 9, 0), (9, 0, 0), Material((0, 0, 0), (1, 1, 4))),
@@ -82,21 +82,21 @@ def lit_apart(**options):
 
 @pytest.mark.parametrize("options", [{}, {"sampler": "uniform", "interpolator": "splat"}])
 def test_layers_add_up_to_the_light_of_the_scene(options):
-    light = lit_apart(**options)
+    light = in_separate_layers(**options)
     assert light.lights == ("key", "dome", "gradient", "image", "one", "two")
     for lit in (*light.grids, *light.walls):
-        apart = mixed(lit.channels, layers_of(light.scene), {}).rgb(lit.light)
-        np.testing.assert_allclose(apart, lit.values, rtol=1e-6, atol=1e-6 * lit.values.max())
+        remixed = mixed(lit.channels, layers_of(light.scene), {}).rgb(lit.light)
+        np.testing.assert_allclose(remixed, lit.values, rtol=1e-6, atol=1e-6 * lit.values.max())
 
 
 def test_layers_of_rbf_are_not_clamped_one_by_one():
     parts = (KEY, Sky("dome", (0.5, 0.6, 0.7)), replace(GRADIENT, name="rest"))
     options = {"sampler": "uniform", "interpolator": "rbf", "isovalues": 4, "grid": 8}
     options |= {"paths": 2, "bounces": 1, "judge": False}
-    apart = ig.run(grey(unit(waves()), lights=parts), **options).mix(key=0.0)
+    separate = ig.run(grey(unit(waves()), lights=parts), **options).mix(key=0.0)
     joined = tuple(replace(part, name="rest") if part.name == "dome" else part for part in parts)
     together = ig.run(grey(unit(waves()), lights=joined), **options).mix(key=0.0)
-    np.testing.assert_allclose(apart.grids[0].values, together.grids[0].values, rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(separate.grids[0].values, together.grids[0].values, rtol=1e-5, atol=1e-5)
 
 
 def test_a_layer_is_the_bake_of_its_light_alone():
@@ -117,7 +117,7 @@ def test_weights_of_lights_move_neither_points_nor_paths():
 
 
 def test_mixes_multiply_the_lights_of_the_scene_and_come_back():
-    light = lit_apart()
+    light = in_separate_layers()
     assert light.mix() is light
     half = light.mix(dome=0.5)
     assert half.grids[0].light is light.grids[0].light or np.shares_memory(half.grids[0].light, light.grids[0].light)
@@ -136,7 +136,7 @@ def test_a_single_light_can_be_weighed():
 
 
 def test_lights_and_their_mix_come_back_from_the_disk(tmp_path):
-    light = lit_apart().mix(key=0.5, dome=2.0)
+    light = in_separate_layers().mix(key=0.5, dome=2.0)
     light.save(tmp_path / "run", preview=False)
     again = ig.load(tmp_path / "run")
     assert again.lights == light.lights and again.weights == light.weights

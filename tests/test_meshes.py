@@ -146,9 +146,9 @@ def test_mesh_and_level_set_differ_like_the_square_of_the_spacing():
             one, answered = worth(Numba(surface="mesh"), scene, queries, path, 3)
             other, also = worth(Numba(surface="levelset"), scene, queries, path, 3)
             assert (answered & also).mean() > 0.99
-            apart = (one - other)[answered & also]
-            share.append((np.abs(apart).max(axis=1) > 0.05).mean())
-            off.append(apart.mean(axis=0))
+            difference = (one - other)[answered & also]
+            share.append((np.abs(difference).max(axis=1) > 0.05).mean())
+            off.append(difference.mean(axis=0))
         turned.append(np.mean(share))
         assert np.abs(np.mean(off, axis=0)).max() < turned[-1]  # no more than what turned: the rest moved by spacing²
     rate = -np.polyfit(np.log([1, 2, 4, 8]), np.log(turned), 1)[0]

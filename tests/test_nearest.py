@@ -50,10 +50,10 @@ def test_every_node_takes_the_nearest_sample_in_the_world():
     points = spec.nodes()[random.integers(0, 120, 300)] + random.normal(scale=0.5, size=(300, 3))
     mean = random.random((300, 3)).astype(np.float32)
     grid = Nearest().fill(answers(points, mean), Nodes(spec, FIELD))
-    apart = np.linalg.norm(spec.nodes()[:, None] - points[None], axis=2)
-    near = apart.min(axis=1) <= np.linalg.norm(UNEVEN)
+    distance = np.linalg.norm(spec.nodes()[:, None] - points[None], axis=2)
+    near = distance.min(axis=1) <= np.linalg.norm(UNEVEN)
     assert near.sum() > 80
-    assert np.array_equal(grid.values.reshape(-1, 3)[near], mean[apart.argmin(axis=1)[near]])
+    assert np.array_equal(grid.values.reshape(-1, 3)[near], mean[distance.argmin(axis=1)[near]])
     assert np.array_equal(grid.support.ravel() > 0, near)
 
 

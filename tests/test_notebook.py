@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from browser import apart, browser, coloured, pair  # noqa: F401
+from browser import browser, coloured, pair, with_separate_lights  # noqa: F401
 from illumgrid.field.lights import Distant
 from illumgrid.show.viewer.widget import _widget_class
 from shapes import lit, refused, sky
@@ -83,7 +83,8 @@ def test_the_view_follows_the_model_and_leads_it(browser):  # noqa: F811
 def test_weights_of_lights_lead_the_view_and_follow_it(browser):  # noqa: F811
     traitlets = pytest.importorskip("traitlets")
     pytest.importorskip("anywidget")
-    view = apart(replace(pair(), lights=(Distant("key", (-1, -1, 1), 25, (3, 2, 1)),))).show(isovalue=2400)
+    scene = replace(pair(), lights=(Distant("key", (-1, -1, 1), 25, (3, 2, 1)),))
+    view = with_separate_lights(scene).show(isovalue=2400)
     lamp, key = sorted(view.weights, key="key".__eq__)
     assert view.weights == {lamp: 1.0, "key": 1.0} and key == "key"
     view.weights = {"key": 2.0}  # the other keeps its weight

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from browser import HEIGHT, WIDTH, apart, bent, browser, coloured, decoded, pair, still, until  # noqa: F401
+from browser import HEIGHT, WIDTH, bent, browser, coloured, decoded, pair, still, until, with_separate_lights  # noqa: F401
 from illumgrid.field.lights import Distant
 from illumgrid.field.scene import Material
 from illumgrid.show import BACKGROUND, fit_camera
@@ -50,7 +50,7 @@ def dark_room_with_a_key():
 
 @pytest.mark.parametrize("scene", [grey_under_a_key, dark_room_with_a_key])
 def test_sliders_mix_the_lights_at_the_exposure_of_the_first_picture(browser, scene):  # noqa: F811
-    baked = apart(scene())
+    baked = with_separate_lights(scene())
     kept = baked.mix(**{baked.lights[0]: 0.8})  # opens at weights of its own
     wanted, address, covered = still(kept, 0.1)
     page = browser.open(kept, address)

@@ -42,8 +42,8 @@ def test_the_scale_is_logarithmic_ends_where_it_says_and_has_no_color_twice():
     colors = scale_colors(bars)
     np.testing.assert_array_equal(scale_colors(np.array([0.0, LOW / 9, HIGH * 9])), colors[[0, 0, -1]])
     np.testing.assert_allclose(scale_colors(np.array([np.sqrt(LOW * HIGH)])), colors[[20]], atol=1e-6)
-    apart = np.abs(encode_srgb(colors[:, None]).astype(int) - encode_srgb(colors)).max(axis=2)
-    assert apart[~np.eye(41, dtype=bool)].min() >= 3
+    distance = np.abs(encode_srgb(colors[:, None]).astype(int) - encode_srgb(colors)).max(axis=2)
+    assert distance[~np.eye(41, dtype=bool)].min() >= 3
     assert (np.diff(colors @ [0.2126, 0.7152, 0.0722]) > 0).all()  # brighter is worse, also printed in gray
 
 

@@ -136,8 +136,8 @@ def test_the_walls_of_the_box_share_their_edges(direction):
         [q.corner + i * q.edge_u + j * q.edge_v for i in (0, 1) for j in (0, 1)] for q in walls
     ]  # each of the eight vertices belongs to three walls
     points = np.reshape(vertices, (-1, 3))
-    apart = np.linalg.norm(points[:, None] - points[None], axis=2)
-    assert ((apart < 1e-9).sum(axis=1) == 3).all()
+    distance = np.linalg.norm(points[:, None] - points[None], axis=2)
+    assert ((distance < 1e-9).sum(axis=1) == 3).all()
     assert sum(q.area for q in walls) > 0
 
 

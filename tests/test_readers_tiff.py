@@ -109,9 +109,9 @@ def test_a_folder_of_slices(tmp_path):
     with pytest.warns(IllumgridWarning, match="nothing how far slices are"):
         assert np.array_equal(read_volume(tmp_path).values, values())  # 8, 9, 10, ...: by number, not by letter
     (tmp_path / "s11.tif").unlink()
-    with pytest.warns(IllumgridWarning) as told:
+    with pytest.warns(IllumgridWarning) as caught:
         assert read_volume(tmp_path).shape == (5, 6, 6)
-    assert any("slices are missing between s10.tif and s12.tif" in str(one.message) for one in told)
+    assert any("slices are missing between s10.tif and s12.tif" in str(one.message) for one in caught)
     tifffile.imwrite(tmp_path / "s11.tif", ZYX[0, :3], photometric="minisblack")
     refused(tmp_path, "its slice s11.tif differs in size")
     tifffile.imwrite(tmp_path / "s11.tif", ZYX, photometric="minisblack")

@@ -79,16 +79,16 @@ def install(tmp_path, monkeypatch):
     return install
 
 
-def told():
+def messages():
     """Warnings issued when the registry is read."""
-    with warnings.catch_warnings(record=True) as heard:
+    with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         registry.entries()
-    return [str(w.message) for w in heard]
+    return [str(w.message) for w in caught]
 
 
 def test_the_packages_own_stages_come_by_hooks_and_are_named_once():
-    assert told() == []
+    assert messages() == []
     entries = registry.entries()
     assert {e.package for e in entries} == {"illumgrid"} and {e.version for e in entries} == {ig.__version__}
     assert {"direct", "uniform", "numba", "reference", "nearest"} <= {e.name for e in entries}
@@ -98,7 +98,7 @@ def test_the_packages_own_stages_come_by_hooks_and_are_named_once():
 
 def test_a_strangers_stage_is_found_and_its_options_are_read(install):
     install("stranger", SAMPLER.replace("NAME", "mine"), "2.5")
-    assert told() == []
+    assert messages() == []
     entry = registry.entry("sampler", "mine")
     assert (entry.package, entry.version, entry.missing()) == ("stranger", "2.5", None)
     found = {o.name: o for o in options(entry.stage)}
@@ -175,9 +175,9 @@ def test_a_broken_plugin_is_a_warning_that_names_it_and_why_and_all_others_run(i
     install("before", SAMPLER.replace("NAME", "first"))
     install(f"bad-{name}", source, "0.3")
     install("later", SAMPLER.replace("NAME", "last"))
-    (sentence,) = told()
+    (sentence,) = messages()
     assert f"bad-{name} 0.3" in sentence and why in sentence and "\n" not in sentence
-    assert told() == []  # once in a process
+    assert messages() == []  # once in a process
     assert ig.sampler("first").name == "first" and ig.sampler("last").name == "last" and ig.sampler("direct")
     refused(lambda: ig.sampler("mine"), "no sampler is named 'mine'")
 
@@ -188,7 +188,7 @@ def test_a_backend_says_what_it_traces(install):
         "def queries(self, scene, specs, seed)", "def solve(self, scene, queries, *, paths, bounces, seed)"
     )
     install("vague", source)
-    assert "geometry is None; expected 'mesh', 'levelset' or 'both'" in told()[0]
+    assert "geometry is None; expected 'mesh', 'levelset' or 'both'" in messages()[0]
 
 
 @pytest.mark.parametrize(
@@ -215,7 +215,7 @@ def test_every_backend_is_listed_once_per_surface():
 
 def test_of_two_hooks_in_a_package_one_may_be_broken(install):
     install("half", STAGE + "\n@hookimpl\ndef register_backends():\n    return [Mine]\n")
-    (sentence,) = told()
+    (sentence,) = messages()
     assert "half 1.0" in sentence and "no method solve" in sentence
     assert ig.sampler("mine").name == "mine"
 
@@ -223,7 +223,7 @@ def test_of_two_hooks_in_a_package_one_may_be_broken(install):
 def test_a_name_that_two_packages_claim_is_an_error_for_its_users_and_a_warning_for_all_others(install):
     install("one", STAGE, "1.2")
     install("two", STAGE, "3.4")
-    (sentence,) = told()
+    (sentence,) = messages()
     for words in ("'mine'", "one 1.2", "two 3.4"):
         assert words in sentence
     assert ig.sampler("direct").name == "direct"
@@ -233,17 +233,17 @@ def test_a_name_that_two_packages_claim_is_an_error_for_its_users_and_a_warning_
 
 def test_nobody_takes_a_name_of_the_packages_own(install):
     install("greedy", SAMPLER.replace("NAME", "direct"))
-    assert "greedy 1.0" in told()[0]
+    assert "greedy 1.0" in messages()[0]
     refused(lambda: ig.sampler("direct"), "illumgrid", "greedy", f"{registry.SWITCH}=greedy")
 
 
 def test_plugins_are_switched_off_all_or_by_name(install, monkeypatch):
     install("My.Own_plugin", "raise SystemError".replace("SystemError", "OSError"))
     install("good", STAGE)
-    assert len(told()) == 1
+    assert len(messages()) == 1
     monkeypatch.setenv(registry.SWITCH, f"{registry.os.environ[registry.SWITCH]}, my-own-plugin")
     registry._reported.clear()
-    assert told() == [] and ig.sampler("mine")
+    assert messages() == [] and ig.sampler("mine")
     monkeypatch.setenv(registry.SWITCH, "1")
     assert {e.package for e in registry.entries()} == {"illumgrid"}
     refused(lambda: ig.sampler("mine"), "no sampler")
@@ -256,7 +256,7 @@ def test_a_stage_that_cannot_run_here_says_what_would_help(install):
             "    def queries", f"{method.replace('ANSWER', answer)}    def queries"
         )
         install(name, source)
-    assert told() == [] and ig.sampler("ready")
+    assert messages() == [] and ig.sampler("ready")
     refused(lambda: ig.sampler("lacking"), "'lacking' cannot run here", "pip install ray")
     refused(lambda: ig.sampler("sick"), "repair sick", "ZeroDivisionError")
 

@@ -36,11 +36,11 @@ def stderr(worth, paths, sky=0.0, lamps=0.0):
 def test_three_implementations_agree(paths, sky, lamps):
     worth = np.random.default_rng(1).exponential(size=(len(paths), 3, 3)) ** 3
     worth[:, 2] = np.round(worth[:, 2], 1)
-    told = reference.spread(worth, paths.start, np.full(3, sky), np.full(3, lamps))
+    estimate = reference.spread(worth, paths.start, np.full(3, sky), np.full(3, lamps))
     for query in range(3):
         for c in range(3):
             loops = naive.spread(worth[:, query, c].tolist(), paths.start, sky, lamps)
-            assert math.isclose(told[query, c], loops, rel_tol=1e-12, abs_tol=1e-300)
+            assert math.isclose(estimate[query, c], loops, rel_tol=1e-12, abs_tol=1e-300)
             mean, m2 = kernels.moments(worth[:, query].copy(), paths.start, sky, lamps, c)
             assert math.isclose(mean, worth[:, query, c].mean(), rel_tol=1e-12)
             assert math.isclose(m2, loops, rel_tol=1e-12, abs_tol=1e-300)
@@ -49,8 +49,8 @@ def test_three_implementations_agree(paths, sky, lamps):
 def test_of_independent_worths_it_is_the_usual_one():
     random = np.random.default_rng(1).normal(size=(2048, 4000, 1))
     for paths in (range(2), range(1, 3), range(3), range(4, 12), range(4, 9)):
-        told = reference.sum_variance(random[: len(paths)], paths.start) / len(paths)
-        assert abs(told.mean() - 1) < 6 * told.std() / math.sqrt(told.size)
+        estimate = reference.sum_variance(random[: len(paths)], paths.start) / len(paths)
+        assert abs(estimate.mean() - 1) < 6 * estimate.std() / math.sqrt(estimate.size)
     for paths, least in ((range(16), 0.82), (range(64), 0.88), (range(3, 40), 0.9), (range(2048), 0.965)):
         # Nets of a quarter of the size may be worse by chance, which is taken for a trend: up to a seventh is lost.
         assert least < reference.sum_variance(random[: len(paths)], paths.start).mean() / len(paths) < 1.01

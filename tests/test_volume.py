@@ -129,9 +129,9 @@ def test_nan_becomes_the_value_farthest_outside_and_infinities_the_extremes(insi
     values = np.arange(12.0).reshape(2, 2, 3) - 2
     values.flat[[0, 1, 10, 11]] = np.nan, -np.inf, np.inf, np.nan
     values.flat[[2, 9]] = 0, 7
-    with pytest.warns(IllumgridWarning, match=r"4 of 12 voxels .*\(0, 0, 0\).*farthest outside") as heard:
+    with pytest.warns(IllumgridWarning, match=r"4 of 12 voxels .*\(0, 0, 0\).*farthest outside") as caught:
         whole = finite(Volume(values), inside).values.ravel()
-    assert len(heard) == 1
+    assert len(caught) == 1
     assert whole[[0, 1, 10, 11]].tolist() == [outermost, 0, 7, outermost]
     assert np.array_equal(whole[2:10], values.ravel()[2:10])
 

@@ -90,7 +90,7 @@ def test_texels_lie_at_the_middles_and_ids_are_their_own(baked):
     assert not np.isin(queries.id, asked).any()
 
 
-def test_a_wall_holds_the_light_that_a_backend_tells_of(baked):
+def test_a_wall_holds_the_light_of_the_backend(baked):
     scene, levels, light = baked
     (wall,) = light.walls
     (queries,) = wall_queries(scene, levels)
@@ -98,8 +98,8 @@ def test_a_wall_holds_the_light_that_a_backend_tells_of(baked):
     answer = Numba().solve(scene, queries, paths=range(8 * more), bounces=2, seed=0)
     good = answer.paths.reshape(4, 7, 13) > 0
     np.testing.assert_array_equal(wall.support > 0, good)
-    told, error = answer.light.reshape(4, 7, 13, -1), answer.error.reshape(4, 7, 13)
-    np.testing.assert_array_equal(wall.light[good], calmed(told, answer.mean.reshape(4, 7, 13, 3), error, good)[good])
+    mean, error = answer.light.reshape(4, 7, 13, -1), answer.error.reshape(4, 7, 13)
+    np.testing.assert_array_equal(wall.light[good], calmed(mean, answer.mean.reshape(4, 7, 13, 3), error, good)[good])
     assert wall.values.dtype == wall.support.dtype == np.float32
     assert light.queries > len(queries)
 
@@ -117,8 +117,8 @@ def test_a_texel_inside_the_solid_takes_the_nearest_one_of_the_same_row(baked):
     for values, support in zip(wall.values, wall.support):
         good = np.argwhere(support > 0)
         for hole in np.argwhere(support == 0):
-            apart = np.linalg.norm((good - hole) * step, axis=1)
-            nearest = good[apart < apart.min() + 1e-9]
+            distance = np.linalg.norm((good - hole) * step, axis=1)
+            nearest = good[distance < distance.min() + 1e-9]
             assert any(np.array_equal(values[tuple(hole)], values[tuple(at)]) for at in nearest)
 
 

@@ -1,6 +1,6 @@
 """The path loop, compiled: rays among quads and level sets, lamps, and the moments of what the paths bring.
 
-Numba's disk cache does not see edits in other files: `lanes.cached` names all whose functions end up in this code; what
+Numba's disk cache does not see edits in other files: `simd.cached` names all whose functions end up in this code; what
 else is imported is frozen. Kernels are serial, release the GIL and depend on nothing but their arguments; threads are
 the caller's business. What stands for a level set is asked through `surfaces`.
 """
@@ -9,8 +9,7 @@ import numpy as np
 from numba.extending import register_jitable
 
 from illumgrid import constants
-from illumgrid.backends import lanes, lights, march, surfaces
-from illumgrid.backends.lanes import cached
+from illumgrid.backends import lights, march, simd, surfaces
 from illumgrid.backends.lights import (
     cosine_direction,
     distant_density,
@@ -24,6 +23,7 @@ from illumgrid.backends.lights import (
 from illumgrid.backends.march import dot
 from illumgrid.backends.mesh import bvh
 from illumgrid.backends.mesh import cast as mesh_cast
+from illumgrid.backends.simd import cached
 from illumgrid.backends.surfaces import begin, inside, meet_solid, solid_normal
 from illumgrid.constants import BURIED, LOST, MISS, NOWHERE, ON_A_WALL, QUAD, UNSEEN
 from illumgrid.rng import draw, draw_pair, mix, net_size, pascal, reverse, sharing, stream, upward
@@ -31,7 +31,7 @@ from illumgrid.rng import draw, draw_pair, mix, net_size, pascal, reverse, shari
 for _function in (mix, stream, draw, reverse, pascal, upward, draw_pair, net_size, sharing):
     register_jitable(_function)
 
-_SOURCES = lanes, lights, march, surfaces, bvh, mesh_cast, constants
+_SOURCES = lights, march, simd, surfaces, bvh, mesh_cast, constants
 jit = cached(*_SOURCES, _nrt=False)  # as in `march`
 inlined = cached(*_SOURCES, _nrt=False, forceinline=True)
 

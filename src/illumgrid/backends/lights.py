@@ -5,12 +5,12 @@
 
 import numpy as np
 
-from illumgrid.backends import lanes, march
-from illumgrid.backends.lanes import cached
+from illumgrid.backends import march, simd
 from illumgrid.backends.march import dot
+from illumgrid.backends.simd import cached
 
-jit = cached(lanes, march, _nrt=False)
-inlined = cached(lanes, march, _nrt=False, forceinline=True)
+jit = cached(simd, march, _nrt=False)
+inlined = cached(simd, march, _nrt=False, forceinline=True)
 
 
 @jit

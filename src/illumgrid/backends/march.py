@@ -7,8 +7,8 @@ spacing[f] for x in the frame of the scene; t is world distance throughout.
 import numpy as np
 
 from illumgrid import constants
-from illumgrid.backends import lanes
-from illumgrid.backends.lanes import address, at_least, cached, count_below
+from illumgrid.backends import simd
+from illumgrid.backends.simd import address, at_least, cached, count_below
 from illumgrid.backends.surfaces import begin, inside, meet_solid, solid_normal
 from illumgrid.constants import BRICK_SHIFT, BURIED, CAP, MISS, NOWHERE, ON_A_VOXEL, REACH, SURFACE
 from illumgrid.field.levelset import Marchable
@@ -16,9 +16,9 @@ from illumgrid.field.levelset import Marchable
 # No fastmath: a miss is t = inf, and the sign of a coefficient near zero decides the side.
 # Nor Numba's reference counts: nothing is allocated here, the caller keeps the arrays alive, and the atomic counts of a
 # scene handed from function to function cost a third of the time.
-jit = cached(lanes, constants, _nrt=False)
+jit = cached(simd, constants, _nrt=False)
 # A call that hands a scene on moves 200 words: what every ray calls is inlined.
-inlined = cached(lanes, constants, _nrt=False, forceinline=True)
+inlined = cached(simd, constants, _nrt=False, forceinline=True)
 
 ONE = np.uint64(1)
 

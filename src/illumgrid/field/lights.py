@@ -39,8 +39,8 @@ class Sky:
         Lights of one name are one layer.
     radiance : array_like
         Linear RGB. (3,): constant. (2, 3): that of the nadir and of the zenith, linear in the height between them.
-        (H, W, 3): an image in latitude and longitude, as one sees it who stands in the middle and looks to the back:
-        row 0 is the zenith, the middle column lies behind the object, the right one of it to the right.
+        (H, W, 3): an image in latitude and longitude, seen from the middle looking to the back: row 0 is the zenith,
+        the middle column lies behind the object, columns right of it to the right.
     """
 
     name: str

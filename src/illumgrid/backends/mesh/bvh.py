@@ -1,6 +1,6 @@
 """Rays against triangle meshes: an eight-wide bounding volume hierarchy, built and traversed by compiled Python.
 
-One ray goes down the tree at a time and meets eight boxes or eight triangles at once (`lanes`).
+One ray goes down the tree at a time and meets eight boxes or eight triangles at once (`simd`).
 """
 
 from typing import Any, NamedTuple
@@ -9,8 +9,8 @@ import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from illumgrid.backends import lanes
-from illumgrid.backends.lanes import (
+from illumgrid.backends import simd
+from illumgrid.backends.simd import (
     WIDE,
     address,
     bits,
@@ -33,7 +33,7 @@ from illumgrid.backends.lanes import (
 )
 
 # No fastmath: the signs of products must be exact, and an empty box is an infinite one.
-jit = cached(lanes)
+jit = cached(simd)
 inlined = numba.njit(nogil=True, error_model="numpy", inline="always")
 
 LINKS = 48  # a node: low x, high x, low y, ... of eight boxes, then eight links

@@ -3,16 +3,16 @@
 import numpy as np
 
 from illumgrid import constants
-from illumgrid.backends import lanes, march
-from illumgrid.backends.lanes import address, cached
+from illumgrid.backends import march, simd
 from illumgrid.backends.march import cell_normal, dot, normal_by_field
 from illumgrid.backends.mesh import bvh
 from illumgrid.backends.mesh.bvh import View, cast
 from illumgrid.backends.mesh.meshes import Meshed
+from illumgrid.backends.simd import address, cached
 from illumgrid.backends.surfaces import begin, inside, meet_solid, solid_normal
 from illumgrid.constants import BURIED, CAP, LOST, MISS, NOWHERE, SURFACE
 
-jit = cached(lanes, bvh, march, constants, _nrt=False)  # as in `march`
+jit = cached(simd, bvh, march, constants, _nrt=False)  # as in `march`
 
 
 @jit

@@ -21,7 +21,7 @@ UNITS = {
 }
 
 PRINTING = {72, 75, 90, 96, 100, 150, 200, 300, 400, 600, 1200}
-"""Dots per inch that programs write who know nothing of the specimen."""
+"""Dots per inch for printing: programs that know nothing of the specimen write them."""
 
 Found = tuple[Floats, str | None, tuple[Note, ...]]
 """Spacing (3,), its unit, and what was assumed."""

@@ -1,4 +1,4 @@
-"""Serve the page to this machine only, and there only to those who know the address."""
+"""Serve the page to this machine only, and only to requests that carry its token."""
 
 import secrets
 import socket

@@ -7,7 +7,7 @@ import numba
 import numpy as np
 import pytest
 
-from illumgrid.backends.lanes import (
+from illumgrid.backends.simd import (
     address,
     bits,
     choose,
@@ -82,7 +82,7 @@ def number():
 """
 USER = """
 import other
-from illumgrid.backends.lanes import cached
+from illumgrid.backends.simd import cached
 
 @cached(other)
 def twice():
