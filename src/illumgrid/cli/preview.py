@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 SIZE = 960, 720
 MOST_PANELS = 32
 
-APART = {
+CONFLICTS = {
     "--sweep": {"--isovalue": "a sweep shows the whole range", "--isovalues": "a sweep shows the whole range"},
     "--isovalues": {
         "--isovalue": "one names all isovalues", "--split": "a strip has one light",
@@ -35,7 +35,7 @@ APART = {
     "--split": {"--local": "--split shows local light on the left"},
     "--camera": dict.fromkeys(("--view", "--zoom", "--up", "--roll"), "the camera of the picture says all of that"),
 }  # fmt: skip
-"""Options that do not go together, and why."""
+"""Options that exclude each other, and the reason."""
 
 
 def preview(
@@ -106,7 +106,6 @@ def preview(
     """Draw an isosurface of a finished run, several side by side, or a sweep through the range."""
     from illumgrid import show
     from illumgrid.chain import load
-    from illumgrid.io import disk
 
     given = {
         "--sweep": sweep is not None, "--isovalue": isovalue is not None, "--isovalues": isovalues is not None,
@@ -124,8 +123,7 @@ def preview(
     look: dict[str, Any] = {"view": view, "zoom": zoom, "up": up, "roll": roll}
     seen_by = None if camera is None else _camera_in(camera)
     if grid_volume:
-        picture = show.grid_volume(light, field, cut=cut, camera=seen_by, **options, **look)
-        disk.write_file(_given(output), show.png(picture, _about(seen_by)))
+        _write(output, show.grid_volume(light, field, cut=cut, camera=seen_by, **options, **look), seen_by)
     else:
         asked = several or ([] if isovalue is None else [isovalue])
         _note_outside(light, field, asked)
@@ -134,18 +132,13 @@ def preview(
         if sweep is not None:
             _film(light, field, sweep, _drawn(light, field, local, split, options), seen_by)
         elif several:
-            picture = show.strip(light, several, field, local=local, **options)
-            disk.write_file(_given(output), show.png(picture, _about(seen_by)))
+            _write(output, show.strip(light, several, field, local=local, **options), seen_by)
         else:
             if trust and camera is None:  # the scale below leaves the picture another aspect
                 options |= look | {"camera": None}
-            picture = _drawn(light, field, local, split, options)(isovalue)
-            disk.write_file(_given(output), show.png(picture, _about(seen_by)))
+            _write(output, _drawn(light, field, local, split, options)(isovalue), seen_by)
     if trust:
-        from illumgrid.show.trust import doubts
-
-        for doubt in doubts(light):
-            say(f"note: {doubt}")
+        _say_doubts(light)
     wrote = f"wrote {output}" if sweep is None else f"wrote {sweep[1]}, {sweep[0]} isovalues"
     say(wrote + ("" if local or trust else f" at exposure {light.exposure * 2**exposure:.4g}"))
     if engine == "auto":
@@ -164,7 +157,7 @@ def _check(
         raise BadInput(f"--output is {output.name!r}; expected a file name that ends in .png")
     if isovalue is not None and not math.isfinite(isovalue):
         raise BadInput(f"--isovalue is {isovalue}; expected a finite number")
-    for one, others in APART.items():
+    for one, others in CONFLICTS.items():
         for other, why in others.items():
             if given[one] and given[other]:
                 raise BadInput(f"{other} came with {one}; expected one of the two: {why}")
@@ -197,9 +190,19 @@ def _numbers(text: str) -> list[float]:
     return numbers
 
 
-def _given(output: Path | None) -> Path:
-    assert output is not None  # _check has seen to it
-    return output
+def _write(output: Path | None, picture: Any, camera: "Camera | None") -> None:
+    from illumgrid.io import disk
+    from illumgrid.show import png
+
+    assert output is not None  # _check has refused that
+    disk.write_file(output, png(picture, _about(camera)))
+
+
+def _say_doubts(light: "Illumination") -> None:
+    from illumgrid.show.trust import doubts
+
+    for doubt in doubts(light):
+        say(f"note: {doubt}")
 
 
 def _camera_in(file: Path) -> "Camera":
