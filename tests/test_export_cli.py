@@ -48,6 +48,8 @@ def test_options_reach_the_file(call, run, tmp_path):
         (["x.glb", "--isovalue", "nan"], ["nan", "finite"]),
         (["x.glb", "--isovalue", "5"], ["5", "0.55 to 0.85"]),
         (["x.glb", "--on", "grid"], ["'on'", "isosurface"]),
+        (["x.vti", "--onto", "m.ply"], ["x.vti", "lattice", ".glb or .ply"]),
+        (["x.glb", "--onto", "m.ply"], ["m.ply", "no such file"]),
         (["x.vti", "--on", "mesh"], ["'mesh'", "grid or field"]),
         (["x.vti", "--array", "error"], ["only a .nrrd"]),
         (["x.nrrd", "--array", "albedo"], ["'albedo'", "irradiance, error, support, field, color"]),

@@ -6,7 +6,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,6 +20,9 @@ from illumgrid.field.scene import Levels, Scene
 from illumgrid.field.upright import sky_axes
 from illumgrid.grid import IlluminationGrid, WallTexture
 from illumgrid.grid.channels import mixed
+
+if TYPE_CHECKING:
+    import trimesh
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,6 +159,50 @@ class Illumination:
         number = self.scene.number_of(field)
         radiance = self.grids[number].lookup(points) * self.scene.fields[number].material.albedo / np.pi
         return tone.encode_srgb(tone.curve(radiance * (self.exposure if exposure is None else exposure)))
+
+    def shade(self, points: ArrayLike, field: str | None = None, exposure: float | None = None) -> NDArray[np.float32]:
+        """Brightness (n,) of a white surface at world points, 0 to 1: luminance of the tone curve of E/π · exposure.
+
+        It multiplies colours of another meaning, such as those of a second quantity. Parameters are those of `color`.
+        """
+        radiance = self.grid(self.scene.fields[self.scene.number_of(field)].name).lookup(points) / np.float32(np.pi)
+        return tone.luminance(tone.curve(radiance * np.float32(self.exposure if exposure is None else exposure)))
+
+    def bake(
+        self, mesh: "trimesh.Trimesh", field: str | None = None, isovalue: float | None = None
+    ) -> "trimesh.Trimesh":
+        """A copy of a mesh with light at its vertices: decimate or smooth first, light afterwards.
+
+        Parameters
+        ----------
+        mesh : trimesh.Trimesh
+            World units, on level sets of the field: an isosurface, or the surface of a segmentation.
+        field : str, optional
+            By default the first.
+        isovalue : float, optional
+            The level set that all vertices lie on; by default each lies on that through itself.
+
+        Returns
+        -------
+        trimesh.Trimesh
+            With the array ``light`` in its `vertex_attributes`, see `shade`. Where the mesh has colours of its own it
+            keeps them; else its vertices have those of `color`.
+
+        Raises
+        ------
+        BadInput
+            If vertices are more than a voxel away from the level sets of the range; the sentence says how many.
+        """
+        from illumgrid.field.onto import onto_levels
+
+        number = self.scene.number_of(field)
+        points = onto_levels(self.scene.fields[number], mesh.vertices, isovalue)
+        lit = mesh.copy()
+        lit.vertex_attributes["light"] = self.shade(points, field)
+        visual: Any = mesh.visual
+        if not visual.defined:
+            lit.visual = type(visual)(lit, vertex_colors=self.color(points, field))
+        return lit
 
     def show(self, isovalue: float | None = None, height: int = 520) -> Any:
         """View in a notebook: the interactive page, with its isovalue as a synced trait.

@@ -55,6 +55,11 @@ def curve(linear: NDArray[np.floating]) -> NDArray[np.floating]:
     return np.asarray(np.where(peak > WHITE, rolled * (share + (1.0 - share) * faded), light), dtype=linear.dtype)
 
 
+def luminance(linear: NDArray[np.floating]) -> NDArray[np.float32]:
+    """Luminance (...,) of linear RGB (..., 3), by the weights of Rec. 709, which are those of sRGB."""
+    return np.asarray(linear @ np.array([0.2126, 0.7152, 0.0722]), np.float32)
+
+
 def srgb_curve(linear: NDArray[np.floating]) -> NDArray[np.floating]:
     """Sample values of sRGB, 0 to 1, of linear display values, clamped to 0 .. 1 (IEC 61966-2-1)."""
     c = np.clip(linear, 0.0, 1.0)

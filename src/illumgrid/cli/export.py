@@ -28,6 +28,14 @@ def export(
             metavar="grid|field", help="Sample at the nodes of the grid or at the voxels of the field. [default: grid]"
         ),
     ] = None,
+    onto: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="MESH",
+            help="Light this mesh, .ply .stl .obj .glb, in place of an isosurface; its vertices lie on level sets of "
+            "the range, with --isovalue on that one.",
+        ),
+    ] = None,
     weights: Weights = None,
     sky: SkyImage = None,
     turn: Turn = 0.0,
@@ -43,12 +51,12 @@ def export(
     from illumgrid.chain import load
     from illumgrid.io import exports, store
 
-    exports.check(file, isovalue, on, array)
+    exports.check(file, isovalue, on, array, onto)
     own = folder / store.EXR
     if file.exists() and own.exists() and file.samefile(own):
         raise BadInput(f"{file} is the run itself; expected another name for the copy")
     with reported_warnings():
         light = relit(load(folder), weights, sky, turn)
         with progress_bars() as progress:
-            written = exports.write(light, file, field, isovalue, on=on, array=array, progress=progress)
+            written = exports.write(light, file, field, isovalue, on=on, array=array, onto=onto, progress=progress)
     say(f"wrote {file}: {written}")

@@ -3,11 +3,12 @@
 import math
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 from illumgrid.errors import BadInput, shown
 from illumgrid.io import disk, needs
 from illumgrid.io.exports import arrays, surface, vti
+from illumgrid.io.readers.mesh import read_mesh
 
 if TYPE_CHECKING:
     from illumgrid.bake import Progress
@@ -18,7 +19,11 @@ SURFACES = {".glb": surface.write_glb, ".ply": surface.write_ply}
 
 
 def check(
-    path: str | os.PathLike[str], isovalue: float | None = None, on: str | None = None, array: str | None = None
+    path: str | os.PathLike[str],
+    isovalue: float | None = None,
+    on: str | None = None,
+    array: str | None = None,
+    onto: str | os.PathLike[str] | None = None,
 ) -> None:
     """Check that these options of `write` go together; reads and writes nothing.
 
@@ -40,6 +45,11 @@ def check(
             f"an isovalue came with {name!r}, which holds the light of every isovalue; leave the isovalue out, or "
             f"write {' or '.join(SURFACES)}"
         )
+    if onto is not None and ending in LATTICES:
+        raise BadInput(
+            f"a mesh came with {name!r}, which holds the light of a lattice; leave it out, or write "
+            f"{' or '.join(SURFACES)}"
+        )
     if on is not None and ending in SURFACES:
         raise BadInput(
             f"'on' came with {name!r}, which holds an isosurface; leave it out, or write {', '.join(LATTICES)}"
@@ -60,6 +70,7 @@ def write(
     *,
     on: str | None = None,
     array: str | None = None,
+    onto: str | os.PathLike[str] | None = None,
     progress: "Progress" = lambda what, done, total: None,
 ) -> str:
     """Write the light of one field to a file that another program reads.
@@ -78,6 +89,9 @@ def write(
         Where the arrays lie: at the nodes of the illumination grid (default), or at the voxels of the field.
     array : {"irradiance", "error", "support", "field", "color"}, optional
         Which array a `.nrrd` holds; by default the irradiance. The other formats hold all.
+    onto : str or path-like, optional
+        File of a mesh to light in place of an isosurface that is extracted: see `Illumination.bake`. A `.ply` then has
+        the property ``light``, a `.glb` the attribute ``_LIGHT``.
     progress : callable, optional
         Called with (what, done, total).
 
@@ -92,16 +106,23 @@ def write(
         On options that do not go together, an unknown field, an isovalue outside the range of the light or without a
         surface, or a file that cannot be written.
     """
-    check(path, isovalue, on, array)
+    check(path, isovalue, on, array, onto)
     number = light.scene.number_of(field)
     ending = Path(path).suffix.lower()
+    if onto is not None:
+        made = surface.lit_onto(light, number, isovalue, read_mesh(onto), Path(onto).suffix.lower() == ".glb")
+        with disk.fresh_file(path) as fresh:
+            SURFACES[ending](fresh, made)
+        return (
+            f"{made.field!r} on {len(made.mesh.vertices)} vertices of {Path(onto).name}, exposure {made.exposure:.4g}"
+        )
     if ending in SURFACES:
         lit = surface.lit(light, number, isovalue, progress)
         with disk.fresh_file(path) as fresh:
             SURFACES[ending](fresh, lit)
         progress("file", 1, 1)
         count = len(lit.mesh.faces)
-        level = shown(lit.isovalue, light.scene.fields[number].range, 6)
+        level = shown(cast(float, lit.isovalue), light.scene.fields[number].range, 6)
         return f"isosurface {level} of {lit.field!r}, {count} triangles, exposure {lit.exposure:.4g}"
     names = (array or "irradiance",) if ending == ".nrrd" else arrays.NAMES
     lattice = light.grids[number].spec if on != "field" else light.scene.fields[number].volume

@@ -1,4 +1,4 @@
-"""One isosurface with its light as the colour of its vertices: glTF (``.glb``) and PLY."""
+"""A surface with its light as the colour of its vertices: glTF (``.glb``) and PLY."""
 
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -10,8 +10,10 @@ from numpy.typing import NDArray
 
 from illumgrid.errors import BadInput, shown, shown_range
 from illumgrid.field.levelset import isosurface
+from illumgrid.field.onto import onto_levels
 from illumgrid.io.exports.arrays import display_linear
-from illumgrid.tone import encode_srgb
+from illumgrid.io.readers.mesh import Y_UP
+from illumgrid.tone import decode_srgb, encode_srgb
 
 if TYPE_CHECKING:
     import trimesh
@@ -19,39 +21,41 @@ if TYPE_CHECKING:
     from illumgrid.bake import Progress
     from illumgrid.light import Illumination
 
-Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
-"""World to glTF: its up, +y, is the world's +z, and its front, +z, the world's -y (in LPS, the face)."""
-
 
 @dataclass(frozen=True, eq=False)
 class LitSurface:
-    """An isosurface and the light on it.
+    """A surface and the light on it.
 
     Parameters
     ----------
     field : str
-    isovalue : float
+    isovalue : float or None
+        None where each vertex lies on the level set through itself.
     exposure : float
     mesh : trimesh.Trimesh
         World units, open where the solid meets the border of the volume.
     linear : (n, 3) float32
-        albedo/π · irradiance · exposure at the vertices, clamped to 0 .. 1.
+        albedo/π · irradiance · exposure at the vertices, clamped to 0 .. 1, or the mesh's own colours.
+    colors : str
+        What `linear` is.
+    shade : (n,) float32, optional
+        Brightness of a white surface, for a mesh that came from elsewhere: see `Illumination.shade`.
     """
 
     field: str
-    isovalue: float
+    isovalue: float | None
     exposure: float
     mesh: "trimesh.Trimesh"
     linear: NDArray[np.float32]
+    colors: str = "albedo/pi * irradiance * exposure"
+    shade: NDArray[np.float32] | None = None
 
     def about(self) -> dict[str, Any]:
         """What a reader of the file should know."""
-        return {
-            "field": self.field,
-            "isovalue": self.isovalue,
-            "exposure": self.exposure,
-            "colors": "albedo/pi * irradiance * exposure",
-        }
+        about: dict[str, Any] = {"field": self.field}
+        if self.isovalue is not None:
+            about["isovalue"] = self.isovalue
+        return about | {"exposure": self.exposure, "colors": self.colors}
 
 
 def lit(light: "Illumination", number: int, isovalue: float | None, progress: "Progress") -> LitSurface:
@@ -80,6 +84,22 @@ def lit(light: "Illumination", number: int, isovalue: float | None, progress: "P
     return LitSurface(field.name, level, light.exposure, mesh, np.clip(colour, 0.0, 1.0))
 
 
+def lit_onto(
+    light: "Illumination", number: int, isovalue: float | None, mesh: "trimesh.Trimesh", linear: bool
+) -> LitSurface:
+    """Light for a mesh that came from elsewhere; colours of its own are kept, and they are `linear` or sRGB."""
+    field = light.scene.fields[number]
+    points = onto_levels(field, mesh.vertices, isovalue)
+    shade = light.shade(points, field.name)
+    visual: Any = mesh.visual
+    if visual.kind in ("vertex", "face"):
+        own = np.asarray(visual.vertex_colors)[:, :3]
+        color = (own / np.float32(255)).astype(np.float32) if linear else decode_srgb(own)
+        return LitSurface(field.name, isovalue, light.exposure, mesh, color, "those of the mesh", shade)
+    color = np.clip(display_linear(light, number, light.grids[number].lookup(points)), 0.0, 1.0)
+    return LitSurface(field.name, isovalue, light.exposure, mesh, color, shade=shade)
+
+
 def write_glb(path: Path, surface: LitSurface) -> None:
     """Write binary glTF 2.0: linear float colours, unlit, y up; the mesh's extras say what the colours are.
 
@@ -90,7 +110,9 @@ def write_glb(path: Path, surface: LitSurface) -> None:
 
     centre = surface.mesh.bounds.mean(axis=0)
     mesh = trimesh.Trimesh(surface.mesh.vertices - centre, surface.mesh.faces, process=False)
-    mesh.vertex_attributes["_light"] = surface.linear
+    mesh.vertex_attributes["_color"] = surface.linear
+    if surface.shade is not None:
+        mesh.vertex_attributes["_LIGHT"] = surface.shade
     mesh.metadata.update(surface.about())
     place = np.eye(4)
     place[:3, :3], place[:3, 3] = Y_UP, Y_UP @ centre
@@ -110,7 +132,7 @@ def _unlit(tree: dict[str, Any]) -> None:
     ]
     for mesh in tree["meshes"]:
         for primitive in mesh["primitives"]:
-            primitive["attributes"]["COLOR_0"] = primitive["attributes"].pop("_light")
+            primitive["attributes"]["COLOR_0"] = primitive["attributes"].pop("_color")
             primitive["material"] = 0
 
 
@@ -120,6 +142,8 @@ def write_ply(path: Path, surface: LitSurface) -> None:
 
     mesh = trimesh.Trimesh(surface.mesh.vertices, surface.mesh.faces, process=False)
     mesh.visual = trimesh.visual.ColorVisuals(mesh, vertex_colors=encode_srgb(surface.linear))
+    if surface.shade is not None:
+        mesh.vertex_attributes["light"] = surface.shade
     content = trimesh.exchange.ply.export_ply(mesh, vertex_normal=False)
     about = {"illumgrid": version("illumgrid"), **surface.about(), "encoding": "sRGB"}
     comments = "".join(f"comment {key} {value}\n" for key, value in about.items())
