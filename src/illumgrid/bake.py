@@ -21,6 +21,7 @@ from illumgrid.stages import Interpolator, Sampler
 from illumgrid.transport.samples import Queries, Samples, combine, join_queries, join_samples
 from illumgrid.transport.stages import fill_nodes
 from illumgrid.transport.tracer import Tracer, answered
+from illumgrid.transport.walk import Keeper, Rank, Walk, answer, split
 
 Progress = Callable[[str, int, int], None]
 """Called with what is being done, how much of it is done, and how much there is."""
@@ -39,10 +40,6 @@ QUERY_ARRAYS = tuple(f.name for f in fields(Queries))
 def shifted_seed(seed: int, shift: int) -> int:
     """Another seed, `shift` further on, within the 64 bits that a seed has."""
     return (seed + shift) % 2**64
-
-
-def _answer(tracer: Tracer, bounces: int, seed: int, work: tuple[Queries, range]) -> Samples:
-    return tracer.solve(work[0], paths=work[1], bounces=bounces, seed=seed)
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,28 +87,40 @@ class Bake:
         paths: range,
         map: Map = map,
         progress: Progress = lambda what, done, total: None,
+        keep: Keeper | None = None,
+        rank: Rank | None = None,
     ) -> "Bake":
-        """Walk the paths with these numbers from every target as well; see `bake` for `map` and `progress`."""
-        work = [(q, range(n * paths.start, n * paths.stop)) for q, n in zip(self.targets, self.weights)]
-        what, done, total = "more light" if self.answers else "light", 0, sum(len(q) for q in self.targets)
-        new, within = [], 0
+        """Walk the paths with these numbers from every target as well; see `bake` for the others."""
+        ranges = [range(n * paths.start, n * paths.stop) for n in self.weights]
+        going = Walk(self.targets, ranges, split(keep.known(self.targets, paths) if keep else None, self.targets))
+        first = np.cumsum([0, *map(len, self.targets)])
+        total, within = int(first[-1]), 0
+        what = "more light" if self.answers else "light"
+        done = sum(int((known.paths >= 0).sum()) for known in going.answers if known is not None)
 
         def tick(count: int) -> None:
             nonlocal within
             within += count
             progress(what, min(done + within, total), total)
 
-        progress(what, 0, total)
+        progress(what, done, total)
         before = answered.set(tick)
         try:
-            for answer in map(partial(_answer, tracer, self.bounces, self.seed), work):
-                new.append(answer)
-                done, within = done + len(answer), 0
+            for found in map(partial(answer, tracer, self.bounces, self.seed), going.pieces(rank)):
+                number, rows = going.take(found)
+                if keep:
+                    keep.keep(first[number] + rows, found)
+                done, within = done + len(rows), 0
                 progress(what, done, total)
         finally:
             answered.reset(before)
-        # The answers bring their queries with them: a large run holds its targets once.
-        return self.merge(replace(self, targets=tuple(a.queries for a in new), answers=tuple(new), walked=(paths,)))
+            if keep:
+                keep.flush()
+        each = (  # a batch of no targets makes no piece of work
+            tracer.solve(q, paths=r, bounces=self.bounces, seed=self.seed) if a is None else a
+            for a, q, r in zip(going.answers, self.targets, ranges)
+        )
+        return self.merge(replace(self, answers=tuple(each), walked=(paths,)))
 
     def merge(self, other: "Bake") -> "Bake":
         """Combine with a bake of the same targets and seed that walked other paths."""

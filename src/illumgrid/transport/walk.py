@@ -1,0 +1,116 @@
+"""A walk of paths from many targets in pieces: any size, any order, kept on the way, the same bits in the end."""
+
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from illumgrid.grid.channels import Channels
+from illumgrid.transport.samples import Queries, Samples
+from illumgrid.transport.tracer import Tracer
+
+PIECE = 1 << 17
+"""Paths in the first piece of work."""
+SECONDS = 2.0
+"""That a piece should take: later ones are sized by the pace of those before."""
+
+Rank = Callable[[Queries], NDArray[np.integer]]
+"""Numbers (n,) by which targets are walked from, lowest first."""
+
+
+class Keeper(Protocol):
+    """Keeps answers while a walk goes on, and gives back those of a walk that was stopped: `illumgrid.io.partial`."""
+
+    def known(self, targets: Sequence[Queries], paths: range) -> Samples | None:
+        """Answers to all targets, one batch after the other, with paths -1 where none is known; None without any."""
+
+    def keep(self, rows: NDArray[np.int64], answer: "Answer") -> None:
+        """Take the answers to some targets, given by their places in all batches one after the other."""
+
+    def flush(self) -> None:
+        """Bring to the disk what was taken."""
+
+
+class Answer(NamedTuple):
+    """What a piece of work brings back: samples without their queries, which stay where they are."""
+
+    light: NDArray[np.float32]
+    spread: NDArray[np.float32]
+    paths: NDArray[np.int32]
+    channels: Channels
+    seconds: float
+
+
+def answer(tracer: Tracer, bounces: int, seed: int, work: tuple[Queries, range]) -> Answer:
+    """Do a piece of work."""
+    begun = time.perf_counter()
+    found = tracer.solve(work[0], paths=work[1], bounces=bounces, seed=seed)
+    return Answer(found.light, found.spread, found.paths, found.channels, time.perf_counter() - begun)
+
+
+@dataclass(eq=False)
+class Walk:
+    """A walk that is going on: pieces of its work, and the answers of each batch as they come in.
+
+    An answer does not depend on what is asked together with it, so a piece may have any size.
+
+    Parameters
+    ----------
+    targets : sequence of Queries
+        Batches.
+    ranges : sequence of range
+        Numbers of the paths from each target of a batch.
+    answers : list of Samples
+        What is known already, one a batch, paths -1 where it is not; None for a batch without any.
+    """
+
+    targets: Sequence[Queries]
+    ranges: Sequence[range]
+    answers: list[Samples | None]
+    size: float = PIECE
+    asked: deque[tuple[int, NDArray[np.int64]]] = field(default_factory=deque)
+
+    def pieces(self, rank: Rank | None = None) -> Iterator[tuple[Queries, range]]:
+        """What is not known yet, as it is asked for: targets of a low rank in all batches first."""
+        ranks = [np.zeros(len(q), np.int8) if rank is None else rank(q) for q in self.targets]
+        for now in sorted({int(r) for each in ranks for r in np.unique(each)}):
+            for number, (queries, paths, known) in enumerate(zip(self.targets, self.ranges, self.answers)):
+                due = ranks[number] == now
+                rows = np.flatnonzero(due if known is None else due & (known.paths < 0))
+                while len(rows):
+                    some, rows = np.split(rows, [max(1, int(self.size / max(len(paths), 1)))])
+                    self.asked.append((number, some))
+                    yield queries if len(some) == len(queries) else queries[some], paths
+
+    def take(self, found: Answer) -> tuple[int, NDArray[np.int64]]:
+        """Put the answer to the piece that has waited longest in its place; returns the batch and the rows in it."""
+        number, rows = self.asked.popleft()
+        pace = len(rows) * len(self.ranges[number]) / max(found.seconds, 1e-3)
+        self.size = min(max(pace * SECONDS, self.size / 4, 1.0), 4 * self.size)
+        queries, arrays = self.targets[number], found[:3]
+        if len(rows) == len(queries):
+            self.answers[number] = Samples(queries, *arrays, found.channels)
+            return number, rows
+        whole = self.answers[number]
+        if whole is None:
+            light, spread = np.zeros((2, len(queries), len(found.channels)), np.float32)
+            unknown = np.full(len(queries), -1, np.int32)
+            whole = self.answers[number] = Samples(queries, light, spread, unknown, found.channels)
+        for own, new in zip((whole.light, whole.spread, whole.paths), arrays):
+            own[rows] = new
+        return number, rows
+
+
+def split(whole: Samples | None, targets: Sequence[Queries]) -> list[Any]:
+    """Answers to each batch, from those to all."""
+    if whole is None:
+        return [None] * len(targets)
+    ends = np.cumsum([0, *map(len, targets)]).tolist()
+    return [
+        Samples(queries, whole.light[a:b], whole.spread[a:b], whole.paths[a:b], whole.channels)
+        for queries, a, b in zip(targets, ends, ends[1:])
+    ]
