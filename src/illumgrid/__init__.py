@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from illumgrid.field.scene import Field, Levels, Material, Quad, Scene
     from illumgrid.field.volume import Volume
     from illumgrid.grid import GridSpec, IlluminationGrid, WallTexture
+    from illumgrid.io.points import density
     from illumgrid.io.readers import read_scene, read_volume
     from illumgrid.light import Illumination
     from illumgrid.registry import backend, interpolator, sampler
@@ -46,6 +47,7 @@ __all__ = [
     "Volume",
     "WallTexture",
     "backend",
+    "density",
     "interpolator",
     "isosurface",
     "load",
@@ -65,6 +67,7 @@ _HOMES = {
     "field.scene": ("Field", "Levels", "Material", "Quad", "Scene"),
     "field.volume": ("Volume",),
     "grid": ("GridSpec", "IlluminationGrid", "WallTexture"),
+    "io.points": ("density",),
     "io.readers": ("read_scene", "read_volume"),
     "light": ("Illumination",),
     "registry": ("backend", "interpolator", "sampler"),

@@ -10,6 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from illumgrid.cli.bench import bench
+from illumgrid.cli.density import density
 from illumgrid.cli.export import export
 from illumgrid.cli.info import info
 from illumgrid.cli.plugins import plugins
@@ -28,7 +29,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
-for command in (run, preview, view, export, info, bench, verify, plugins):
+for command in (run, preview, view, export, info, density, bench, verify, plugins):
     app.command()(command)
 
 

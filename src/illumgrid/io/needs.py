@@ -21,6 +21,8 @@ TO_LIGHT = 44
 """Bytes a voxel for diagnosis, preparation and writing of a field."""
 TO_EXPORT = 75
 """Bytes a point for all arrays in one file."""
+TO_DEPOSIT = 18
+"""Bytes a voxel for the density of points."""
 _QUERY, _CHANNEL = 300, 20
 """Bytes a query, and for each channel of its answer."""
 _SOME = 50_000

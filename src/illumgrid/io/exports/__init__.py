@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 from illumgrid.errors import BadInput, shown
+from illumgrid.field.volume import Volume
 from illumgrid.io import disk, needs
 from illumgrid.io.exports import arrays, surface, vti
 from illumgrid.io.readers.mesh import read_mesh
@@ -15,6 +16,8 @@ if TYPE_CHECKING:
     from illumgrid.light import Illumination
 
 LATTICES = {".vti": vti.write, ".nrrd": arrays.write_nrrd, ".exr": arrays.write_exr, ".npz": arrays.write_npz}
+FIELDS = {ending: LATTICES[ending] for ending in (".nrrd", ".vti", ".npz")}
+"""Those that `read_volume` reads back with all digits."""
 SURFACES = {".glb": surface.write_glb, ".ply": surface.write_ply}
 
 
@@ -134,3 +137,23 @@ def write(
     shape = " x ".join(map(str, points.lattice.shape))
     where = "voxels" if on == "field" else "nodes"
     return f"{', '.join(points.arrays)} of {points.field!r} at {shape} {where}"
+
+
+def check_field(path: str | os.PathLike[str]) -> None:
+    """Refuse a name whose ending is none of a field's file."""
+    if Path(path).suffix.lower() not in FIELDS:
+        raise BadInput(f"the file to write is {Path(path).name!r}; expected a name that ends in {', '.join(FIELDS)}")
+
+
+def write_field(
+    volume: Volume,
+    path: str | os.PathLike[str],
+    name: str,
+    progress: "Progress" = lambda what, done, total: None,
+) -> None:
+    """Write a field without light to a `.nrrd`, `.vti` or `.npz`, as the array "field"; whole, or not at all."""
+    check_field(path)
+    needs.check("the file", needs.TO_EXPORT * math.prod(volume.shape) / len(arrays.NAMES), "choose a larger spacing")
+    points = arrays.Points(name, volume, {"field": volume.in_units(volume.values)})
+    with disk.fresh_file(path) as fresh:
+        FIELDS[Path(path).suffix.lower()](fresh, points, progress)

@@ -36,17 +36,17 @@ class Points:
         Where the points lie in the world.
     arrays : dict of array
         By name: irradiance (linear RGB, float32), error, support, field (float32), color (sRGB, uint8).
-    albedo : (3,) float64
-        Of the field's material.
-    exposure : float
+    albedo : (3,) float64, optional
+        Of the field's material; None where there is no light.
+    exposure : float, optional
         What `color` was exposed by: sRGB of the tone curve of albedo/π · irradiance · exposure.
     """
 
     field: str
     lattice: Lattice
     arrays: dict[str, NDArray[Any]]
-    albedo: Floats
-    exposure: float
+    albedo: Floats | None = None
+    exposure: float | None = None
 
 
 def display_linear(light: "Illumination", number: int, irradiance: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -164,7 +164,8 @@ def write_npz(path: Path, points: Points, progress: "Progress") -> None:
     lattice = points.lattice
     progress("file", 0, 1)
     place: dict[str, Any] = {name: getattr(lattice, name) for name in ("origin", "spacing", "direction")}
-    place |= {"albedo": points.albedo, "exposure": np.float64(points.exposure)}
+    if points.albedo is not None and points.exposure is not None:
+        place |= {"albedo": points.albedo, "exposure": np.float64(points.exposure)}
     with path.open("wb") as file:  # to a name that ends otherwise, as in .NPZ, NumPy adds .npz
         np.savez_compressed(file, **(points.arrays | place))
     progress("file", 1, 1)

@@ -52,11 +52,7 @@ def write(path: Path, points: Points, progress: "Progress") -> None:
 <VTKFile {kind} compressor="vtkZLibDataCompressor">
 <ImageData WholeExtent="{extent}" Origin="{_text(points.lattice.origin)}" Spacing="{_text(points.lattice.spacing)}"
  Direction="{_text(points.lattice.direction)}">
-<FieldData>
-<DataArray type="Float64" Name="albedo" NumberOfTuples="3" format="ascii">{_text(points.albedo)}</DataArray>
-<DataArray type="Float64" Name="exposure" NumberOfTuples="1" format="ascii">{_text(points.exposure)}</DataArray>
-</FieldData>
-<Piece Extent="{extent}">
+{_light(points)}<Piece Extent="{extent}">
 <PointData Scalars="field">
 {chr(10).join(entries)}
 </PointData>
@@ -69,6 +65,17 @@ _"""
         file.writelines(packed)
         file.write(b"\n</AppendedData>\n</VTKFile>\n")
     progress("file", total, total)
+
+
+def _light(points: Points) -> str:
+    """How colours were made, as field data; nothing where there is no light."""
+    if points.albedo is None or points.exposure is None:
+        return ""
+    return f"""<FieldData>
+<DataArray type="Float64" Name="albedo" NumberOfTuples="3" format="ascii">{_text(points.albedo)}</DataArray>
+<DataArray type="Float64" Name="exposure" NumberOfTuples="1" format="ascii">{_text(points.exposure)}</DataArray>
+</FieldData>
+"""
 
 
 def _text(numbers: ArrayLike) -> str:

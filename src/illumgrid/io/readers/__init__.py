@@ -11,7 +11,8 @@ import struct
 import tokenize
 import zipfile
 import zlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +35,7 @@ from illumgrid.io.readers.stored import (
     downsample as coarser,
 )
 
-__all__ = ["read_scene", "read_volume", "volume_name"]
+__all__ = ["named", "read_scene", "read_volume", "volume_name"]
 
 UNREADABLE = (
     *(RuntimeError, OSError, EOFError, ValueError, TypeError, OverflowError, SyntaxError, LookupError, ArithmeticError),
@@ -113,8 +114,7 @@ def read_volume(
     if not os.fspath(path):
         raise BadInput(f"the name of the volume is empty; {EXPECTED}")  # and not the folder one is in
     file = Path(os.path.abspath(path))
-    shown = _printable(file.name.encode("utf-8", "replace").decode())
-    try:
+    with named(file, EXPECTED) as shown:
         stored = _read(file, Wanted(channel, time, array))
         if spacing is not None:
             stored = with_spacing(stored, spacing)
@@ -127,15 +127,23 @@ def read_volume(
         if downsample is not None:
             stored = coarser(stored, downsample)
         volume, notes = place(stored)
+    for name, sentence in notes:
+        tell(name, f"{shown}: {_printable(sentence)}", stacklevel=2)
+    return volume
+
+
+@contextmanager
+def named(file: Path, expected: str) -> Iterator[str]:
+    """Begin every refusal with the name of a file; whatever libraries raise on it is one. Gives the name to show."""
+    shown = _printable(file.name.encode("utf-8", "replace").decode())
+    try:
+        yield shown
     except BadInput as problem:
         raise BadInput(f"{shown}: {_printable(str(problem))}") from None
     except MemoryError as problem:
         raise BadInput(f"{shown}: too large for the memory of this machine; expected less; coarsen it") from problem
     except UNREADABLE as problem:
-        raise BadInput(f"{shown}: was not understood ({_reason(problem)}); {EXPECTED}") from problem
-    for name, sentence in notes:
-        tell(name, f"{shown}: {_printable(sentence)}", stacklevel=2)
-    return volume
+        raise BadInput(f"{shown}: was not understood ({_reason(problem)}); {expected}") from problem
 
 
 def _printable(text: str) -> str:

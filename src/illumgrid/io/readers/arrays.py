@@ -63,12 +63,12 @@ def _choose(shapes: dict[str, tuple[int, ...]], array: Choice) -> str:
 
 def _head_of(pack: zipfile.ZipFile, info: zipfile.ZipInfo) -> Header:
     with pack.open(info) as stream:
-        return _header(stream)
+        return header(stream)
 
 
 def _place(pack: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDArray[np.float64]:
     with pack.open(info) as stream:
-        shape, fortran, dtype, _ = _header(stream)
+        shape, fortran, dtype, _ = header(stream)
         if dtype.kind not in "iuf" or shape not in ((3,), (3, 3)):
             raise BadInput(f"{info.filename} has shape {shape}, dtype {dtype}; expected 3 or 3x3 numbers; leave it out")
         return read_array(stream, dtype, shape, "F" if fortran else "C").astype(float)
@@ -76,7 +76,7 @@ def _place(pack: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDArray[np.float64]:
 
 def _read_npy(stream: IO[bytes], most: int, wanted: Wanted) -> NDArray[Any]:
     """Read the one array of a .npy stream that holds at most `most` bytes."""
-    shape, fortran, dtype, start = _header(stream)
+    shape, fortran, dtype, start = header(stream)
     if dtype.kind not in "biuf":
         raise BadInput(f"the values have dtype {dtype}; expected real numbers; save the magnitude or one component")
     if not 3 <= len(shape) <= 5 or min(shape) < 1:
@@ -107,7 +107,8 @@ def _three_axes(values: NDArray[Any], wanted: Wanted) -> NDArray[Any]:
     return values
 
 
-def _header(stream: IO[bytes]) -> Header:
+def header(stream: IO[bytes]) -> Header:
+    """The header of a .npy stream, which is left at its data."""
     start = stream.read(12)
     if len(start) < 12 or not start.startswith(b"\x93NUMPY"):
         raise BadInput("does not begin like a .npy array; expected what numpy.save writes; write it again")

@@ -36,7 +36,8 @@ def read_scene(path: str | os.PathLike[str], *, smoothing: float = 0.0) -> Scene
     ----------
     path : str or path-like
         UTF-8, at most 1 MB, with these tables: ``[[field]]``, one or more, with `name`, `volume` (what `read_volume`
-        reads, relative to this file) and perhaps `albedo`, `emission`, `range`, `inside`, `falling`, `signed` (true:
+        reads, relative to this file), or `points` with `spacing`, `sigma` and perhaps `weights`, `columns`, `cell` (see
+        `density`), and perhaps `albedo`, `emission`, `range`, `inside`, `falling`, `signed` (true:
         two fields, ``NAME-positive`` where h >= c and ``NAME-negative`` where h <= -c), and the options of
         `read_volume` (`spacing`, `channel`, `time`, `array`, `label`, `crop`, `downsample`); ``[[quad]]`` with `name`,
         `corner`, `edge_u`, `edge_v` and perhaps `albedo`, `emission`, `texels`, `light`; ``[[light]]`` with `name` and
@@ -167,6 +168,40 @@ _READING: Mapping[str, Take] = {
     "downsample": _whole,
 }
 """What `read_volume` takes."""
+
+
+def _distances(key: str, value: Any) -> float | list[float]:
+    """A number, or three along x, y, z."""
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        return float(value)
+    three: list[float] = _numbers(3, "a positive number, or three in brackets (along x, y, z)")(key, value)
+    return three
+
+
+def _sigma(key: str, value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise BadInput(f"{key} is {_shown(value)}; expected the standard deviation of the Gaussian, in world units")
+    return float(value)
+
+
+def _cell(key: str, value: Any) -> Any:
+    return value if value == "file" else _distances(key, value)
+
+
+def _columns(key: str, value: Any) -> list[str]:
+    if not (isinstance(value, list) and len(value) == 3 and all(isinstance(name, str) and name for name in value)):
+        raise BadInput(f"{key} is {_shown(value)}; expected three names in brackets (of x, y and z)")
+    return value
+
+
+_DENSITY: Mapping[str, Take] = {
+    "spacing": _distances,
+    "sigma": _sigma,
+    "weights": _text,
+    "columns": _columns,
+    "cell": _cell,
+}
+"""What `density` takes beside the points."""
 _MATERIAL = {"albedo": _COLOUR, "emission": _COLOUR}
 _FIELD: Mapping[str, Take] = {
     "name": _text,
@@ -178,6 +213,12 @@ _FIELD: Mapping[str, Take] = {
     "signed": _yes,
     **_READING,
 }
+_POINTS: Mapping[str, Take] = {
+    "points": _text,
+    **{key: take for key, take in _FIELD.items() if key not in ("volume", *_READING)},
+    **_DENSITY,
+}
+"""A field made from points, in place of a volume."""
 _QUAD: Mapping[str, Take] = {
     "name": _text,
     "corner": _VECTOR,
@@ -238,7 +279,13 @@ def _listed(tables: Table, kind: str, keys: Mapping[str, Take], required: tuple[
         name = table.get("name")
         place = f"[[{kind}]] {number}" + (f" {_shown(name)}" if isinstance(name, str) else "")
         with _place(place):
-            placed.append((place, _with_material(_checked(table, keys, required))))
+            if kind == "field" and "points" in table:
+                if "volume" in table:
+                    raise BadInput("points and volume came together; expected one of them; leave the other out")
+                checked = _checked(table, _POINTS, ("name", "points", "spacing", "sigma"))
+            else:
+                checked = _checked(table, keys, required)
+            placed.append((place, _with_material(checked)))
     return placed
 
 
@@ -300,7 +347,8 @@ def _fields(table: Table, volume: Volume) -> tuple[Field, ...]:
             if key in table:
                 raise BadInput(f"signed and {key} came together; expected one of them; leave {key} out")
         return signed_pair(table["name"], volume, table.get("range"), table["material"])
-    return (Field(**{**_without(table, {**_READING, "signed": 0}), "volume": volume}),)
+    own = _without(table, {**_READING, **_DENSITY, "points": 0, "signed": 0})
+    return (Field(**{**own, "volume": volume}),)
 
 
 def _without(table: Table, keys: Mapping[str, Any]) -> Table:
@@ -315,13 +363,17 @@ def _with_material(table: Table) -> Table:
 
 def _volume(table: Table, folder: Path, smoothing: float, read: dict[str, Volume]) -> Volume:
     """Volume of a field, smoothed; `read` keeps what other fields have read."""
+    from illumgrid.io.points import density_of_file
     from illumgrid.io.readers import read_volume
 
-    reading = {key: table[key] for key in _READING if key in table}
-    known = f"{table['volume']} {reading}"
-    with _place("volume"):
+    read_by, named, keys = (
+        (density_of_file, "points", _DENSITY) if "points" in table else (read_volume, "volume", _READING)
+    )
+    reading = {key: table[key] for key in keys if key in table}
+    known = f"{table[named]} {reading}"
+    with _place(named):
         if known not in read:
-            read[known] = read_volume(folder / table["volume"], **reading)
+            read[known] = read_by(folder / table[named], **reading)
         if smoothing == 0:
             return read[known]
         whole = without_gaps(read[known]) if table.get("signed") else finite(read[known], table.get("inside", "above"))
