@@ -201,12 +201,22 @@ def enter(ux, uy, uz, ix, iy, iz, kx, ky, kz, last_x, last_y, last_z):
 
 
 @inlined
-def cells_to_ask(bricks, brick, rank, cx, cy, cz, end_x, end_y, end_z):
+def cell_at(u, t, d, low, high):
+    """Cell, of those of a brick, at distance t along a ray."""
+    return (
+        follow(u[0], t, d[0], low[0], high[0]),
+        follow(u[1], t, d[1], low[1], high[1]),
+        follow(u[2], t, d[2], low[2], high[2]),
+    )
+
+
+@inlined
+def cells_to_ask(bricks, brick, rank, c, end):
     """Cells of a brick, as bits, that rank high enough and lie between the cells of a ray's two ends."""
     left = at_least(bricks, brick, rank)
-    left &= BETWEEN[((min(cx, end_x) & 3) << 2) | (max(cx, end_x) & 3)]
-    left &= BETWEEN[16 | ((min(cy, end_y) & 3) << 2) | (max(cy, end_y) & 3)]
-    left &= BETWEEN[32 | ((min(cz, end_z) & 3) << 2) | (max(cz, end_z) & 3)]
+    left &= BETWEEN[((min(c[0], end[0]) & 3) << 2) | (max(c[0], end[0]) & 3)]
+    left &= BETWEEN[16 | ((min(c[1], end[1]) & 3) << 2) | (max(c[1], end[1]) & 3)]
+    left &= BETWEEN[32 | ((min(c[2], end[2]) & 3) << 2) | (max(c[2], end[2]) & 3)]
     return left
 
 
@@ -222,149 +232,180 @@ def root_in_cell(values, corner, step_x, step_y, level, ex, ey, ez, dx, dy, dz, 
 
 
 @inlined
-def march(scene, f, level, ux, uy, uz, dx, dy, dz, on_surface, limit):
-    """First meeting of a ray with the solid of field f, in index coordinates u + t d.
+def planes_along(u, d):
+    """For each axis i and k such that a ray meets the plane at index coordinate p at t = p i + k.
+
+    A ray parallel to it never does: i = 0, k = inf. Bricks and cells compute it alike, so that a brick's last cell ends
+    exactly where the brick does.
+    """
+    ix, iy, iz = (
+        1.0 / d[0] if d[0] != 0.0 else 0.0,
+        1.0 / d[1] if d[1] != 0.0 else 0.0,
+        1.0 / d[2] if d[2] != 0.0 else 0.0,
+    )
+    kx = -u[0] * ix if d[0] != 0.0 else np.inf
+    ky = -u[1] * iy if d[1] != 0.0 else np.inf
+    kz = -u[2] * iz if d[2] != 0.0 else np.inf
+    return (ix, iy, iz), (kx, ky, kz)
+
+
+@inlined
+def enter_field(u, d, i, k, last, limit):
+    """Where a ray enters the box of a field: (t, t where it leaves, axis of the face, position, cell).
+
+    The x of the cell is -1 if it passes by, or comes to the box beyond `limit`.
+    """
+    outside = np.inf, np.inf, -1, u, (-1, -1, -1)
+    t, face = enter(u[0], u[1], u[2], i[0], i[1], i[2], k[0], k[1], k[2], last[0], last[1], last[2])
+    if t == np.inf:
+        return outside
+    t_out = min(
+        limit, max(k[0], last[0] * i[0] + k[0]), max(k[1], last[1] * i[1] + k[1]), max(k[2], last[2] * i[2] + k[2])
+    )
+    if t > t_out:
+        return outside
+    px = min(max(u[0] + t * d[0], 0.0), last[0]) if face != 0 else (0.0 if d[0] > 0.0 else 1.0 * last[0])
+    py = min(max(u[1] + t * d[1], 0.0), last[1]) if face != 1 else (0.0 if d[1] > 0.0 else 1.0 * last[1])
+    pz = min(max(u[2] + t * d[2], 0.0), last[2]) if face != 2 else (0.0 if d[2] > 0.0 else 1.0 * last[2])
+    cx, cy, cz = first_cell(px, d[0], last[0]), first_cell(py, d[1], last[1]), first_cell(pz, d[2], last[2])
+    if cx < 0 or cy < 0 or cz < 0 or cx >= last[0] or cy >= last[1] or cz >= last[2]:
+        return outside
+    return t, t_out, face, (px, py, pz), (cx, cy, cz)
+
+
+@inlined
+def far_sides(b, ahead):
+    """Index coordinates of the planes through which a ray may leave brick b."""
+    return (
+        1.0 * ((b[0] + ahead[0]) << BRICK_SHIFT),
+        1.0 * ((b[1] + ahead[1]) << BRICK_SHIFT),
+        1.0 * ((b[2] + ahead[2]) << BRICK_SHIFT),
+    )
+
+
+@inlined
+def hit_in_brick(values, start, step_x, step_y, level, left, cell, u, d, i, k, ahead, toward, t, t_end, on_surface):
+    """Follow a ray from cell to cell of a brick (Amanatides & Woo 1987), from `cell` at t on: (t, whether it hit).
+
+    The cubic is asked in the cells `left` only, given as bits, none of which lies beyond t_end.
+    """
+    plane_x, plane_y, plane_z = 1.0 * (cell[0] + ahead[0]), 1.0 * (cell[1] + ahead[1]), 1.0 * (cell[2] + ahead[2])
+    at = ((cell[0] & 3) << 4) | ((cell[1] & 3) << 2) | (cell[2] & 3)
+    while left != 0:
+        sx, sy, sz = plane_x * i[0] + k[0], plane_y * i[1] + k[1], plane_z * i[2] + k[2]
+        t_cell = max(t, min(sx, sy, sz))
+        bit = ONE << np.uint64(at)
+        if left & bit != 0:
+            left ^= bit
+            lx, ly, lz = plane_x - ahead[0], plane_y - ahead[1], plane_z - ahead[2]
+            corner = start + int(lx) * step_x + int(ly) * step_y + int(lz)
+            ex = min(max(u[0] + t * d[0] - lx, 0.0), 1.0)
+            ey = min(max(u[1] + t * d[1] - ly, 0.0), 1.0)
+            ez = min(max(u[2] + t * d[2] - lz, 0.0), 1.0)
+            root = root_in_cell(
+                values, corner, step_x, step_y, level, ex, ey, ez, d[0], d[1], d[2], on_surface, t_cell - t
+            )
+            if root < np.inf:
+                return t + root, True
+        on_surface = False
+        t = t_cell
+        if t >= t_end:
+            break
+        on_x, on_y = first_of(sx, sy, sz)
+        plane_x += 1.0 * toward[0] if on_x else 0.0
+        plane_y += 1.0 * toward[1] if on_y else 0.0
+        plane_z += 0.0 if on_x or on_y else 1.0 * toward[2]
+        at += 16 * toward[0] if on_x else (4 * toward[1] if on_y else toward[2])
+    return t, False
+
+
+@inlined
+def leap(hop, b, far, u, d, i, k, toward, t):
+    """Leap over the cube of empty bricks that reaches `hop` bricks beyond b: (t, the brick behind it)."""
+    end_x, end_y, end_z = b[0] + hop * toward[0], b[1] + hop * toward[1], b[2] + hop * toward[2]
+    tx = (far[0] + 4.0 * (hop * toward[0])) * i[0] + k[0]
+    ty = (far[1] + 4.0 * (hop * toward[1])) * i[1] + k[1]
+    tz = (far[2] + 4.0 * (hop * toward[2])) * i[2] + k[2]
+    t = max(t, min(tx, ty, tz))
+    by_x, by_y = first_of(tx, ty, tz)
+    mx = min(max(int(u[0] + t * d[0]) >> 2, min(b[0], end_x)), max(b[0], end_x))
+    my = min(max(int(u[1] + t * d[1]) >> 2, min(b[1], end_y)), max(b[1], end_y))
+    mz = min(max(int(u[2] + t * d[2]) >> 2, min(b[2], end_z)), max(b[2], end_z))
+    return t, (
+        end_x + toward[0] if by_x else mx,
+        end_y + toward[1] if by_y else my,
+        mz if by_x or by_y else end_z + toward[2],
+    )
+
+
+@inlined
+def march(scene, f, level, u, d, on_surface, limit):
+    """First meeting of a ray with the solid of field f, in index coordinates u + t d: (t, what, axis of a cap).
 
     Bytes are compared first: see `field.bricks`. The ray leaps over the largest cube of bricks ahead that ranks
     below the level. A brick that does not is crossed at once too if no cell between the ray's two ends in it ranks high
-    enough; else the ray goes from cell to cell (Amanatides & Woo 1987) and asks the cubic in such cells only.
-    `on_surface`: the ray starts on the level set itself, outside. Returns (t, what, face), face the axis of a cap.
+    enough; else the ray goes from cell to cell and asks the cubic in such cells only.
+    `on_surface`: the ray starts on the level set itself, outside.
     """
-    last_x, last_y, last_z = scene.shape[f, 0] - 1, scene.shape[f, 1] - 1, scene.shape[f, 2] - 1
-    # A plane at index coordinate p is met at t = p i + k; a ray parallel to it never does: i = 0, k = inf.
-    # Bricks and cells compute it alike, so that a brick's last cell ends exactly where the brick does.
-    ix, iy, iz = 1.0 / dx if dx != 0.0 else 0.0, 1.0 / dy if dy != 0.0 else 0.0, 1.0 / dz if dz != 0.0 else 0.0
-    kx = -ux * ix if dx != 0.0 else np.inf
-    ky = -uy * iy if dy != 0.0 else np.inf
-    kz = -uz * iz if dz != 0.0 else np.inf
-
-    # Enter the box of the field.
-    t, face = enter(ux, uy, uz, ix, iy, iz, kx, ky, kz, last_x, last_y, last_z)
-    if t == np.inf:
-        return np.inf, MISS, -1
-    t_out = min(limit, max(kx, last_x * ix + kx), max(ky, last_y * iy + ky), max(kz, last_z * iz + kz))
-    if t > t_out:
-        return np.inf, MISS, -1
-    px = min(max(ux + t * dx, 0.0), last_x) if face != 0 else (0.0 if dx > 0.0 else 1.0 * last_x)
-    py = min(max(uy + t * dy, 0.0), last_y) if face != 1 else (0.0 if dy > 0.0 else 1.0 * last_y)
-    pz = min(max(uz + t * dz, 0.0), last_z) if face != 2 else (0.0 if dz > 0.0 else 1.0 * last_z)
-    cx, cy, cz = first_cell(px, dx, last_x), first_cell(py, dy, last_y), first_cell(pz, dz, last_z)
-    if cx < 0 or cy < 0 or cz < 0 or cx >= last_x or cy >= last_y or cz >= last_z:
+    last = scene.shape[f, 0] - 1, scene.shape[f, 1] - 1, scene.shape[f, 2] - 1
+    i, k = planes_along(u, d)
+    t, t_out, face, p, c = enter_field(u, d, i, k, last, limit)
+    if c[0] < 0:
         return np.inf, MISS, -1
 
     # In the solid already: at a cap, or buried.
     step_y, start = scene.shape[f, 2], scene.start[f]
     step_x = step_y * scene.shape[f, 1]
     if not on_surface:
-        corner = start + cx * step_x + cy * step_y + cz
-        q0, _, _, _ = cubic(scene.values, corner, step_x, step_y, level, px - cx, py - cy, pz - cz, dx, dy, dz)
+        corner = start + c[0] * step_x + c[1] * step_y + c[2]
+        q0, _, _, _ = cubic(
+            scene.values, corner, step_x, step_y, level, p[0] - c[0], p[1] - c[1], p[2] - c[2], d[0], d[1], d[2]
+        )
         if q0 >= 0.0:
             return t, (CAP if face >= 0 else BURIED), face
 
     # From brick to brick.
-    ahead_x, ahead_y, ahead_z = int(dx > 0.0), int(dy > 0.0), int(dz > 0.0)
-    toward_x, toward_y, toward_z = 2 * ahead_x - 1, 2 * ahead_y - 1, 2 * ahead_z - 1
-    along_x, along_y, along_z = 1.0 * toward_x, 1.0 * toward_y, 1.0 * toward_z
+    ahead = int(d[0] > 0.0), int(d[1] > 0.0), int(d[2] > 0.0)
+    toward = 2 * ahead[0] - 1, 2 * ahead[1] - 1, 2 * ahead[2] - 1
     many_y, many_z = scene.brick_shape[f, 1], scene.brick_shape[f, 2]
     bricks = address(scene.bricks) + (scene.brick_start[f] << 7)
-    octant = 64 + 8 * (4 * ahead_x + 2 * ahead_y + ahead_z)
-    hop_x, hop_y, hop_z = (toward_x * many_y * many_z) << 7, (toward_y * many_z) << 7, toward_z << 7
+    octant = 64 + 8 * (4 * ahead[0] + 2 * ahead[1] + ahead[2])
     rank = rank_of(scene.steps[f], level)
-    bx, by, bz = cx >> BRICK_SHIFT, cy >> BRICK_SHIFT, cz >> BRICK_SHIFT
-    brick = ((bx * many_y + by) * many_z + bz) << 7
-    far_x = 1.0 * ((bx + ahead_x) << BRICK_SHIFT)
-    far_y = 1.0 * ((by + ahead_y) << BRICK_SHIFT)
-    far_z = 1.0 * ((bz + ahead_z) << BRICK_SHIFT)
-    beyond = (scene.brick_shape[f, 0] * many_y * many_z) << 7
+    b = c[0] >> BRICK_SHIFT, c[1] >> BRICK_SHIFT, c[2] >> BRICK_SHIFT
+    brick, beyond = ((b[0] * many_y + b[1]) * many_z + b[2]) << 7, (scene.brick_shape[f, 0] * many_y * many_z) << 7
     started = False
     while 0 <= brick < beyond:  # t_out ends the march before that, but for rounding; what follows reads raw memory
-        empty = count_below(bricks, brick + octant, rank)
-        if empty <= 1:
-            # Cross one brick, cell by cell where it is not empty.
-            tx, ty, tz = far_x * ix + kx, far_y * iy + ky, far_z * iz + kz
+        empty, far = count_below(bricks, brick + octant, rank), far_sides(b, ahead)
+        if empty == 8:
+            return np.inf, MISS, -1
+        if empty > 1:
+            t, b = leap(REACH[empty - 1] - 1, b, far, u, d, i, k, toward, t)
+        else:
+            tx, ty, tz = far[0] * i[0] + k[0], far[1] * i[1] + k[1], far[2] * i[2] + k[2]
             t_brick = min(tx, ty, tz)
             if empty == 0:
-                low_x, low_y, low_z = bx << BRICK_SHIFT, by << BRICK_SHIFT, bz << BRICK_SHIFT
-                high_x, high_y, high_z = (
-                    min(low_x + 4, last_x) - 1,
-                    min(low_y + 4, last_y) - 1,
-                    min(low_z + 4, last_z) - 1,
-                )
+                low = b[0] << BRICK_SHIFT, b[1] << BRICK_SHIFT, b[2] << BRICK_SHIFT
+                high = min(low[0] + 4, last[0]) - 1, min(low[1] + 4, last[1]) - 1, min(low[2] + 4, last[2]) - 1
                 if started:
-                    cx = follow(ux, t, dx, low_x, high_x)
-                    cy = follow(uy, t, dy, low_y, high_y)
-                    cz = follow(uz, t, dz, low_z, high_z)
-                end_x = follow(ux, t_brick, dx, low_x, high_x)
-                end_y = follow(uy, t_brick, dy, low_y, high_y)
-                end_z = follow(uz, t_brick, dz, low_z, high_z)
-                left = cells_to_ask(bricks, brick, rank, cx, cy, cz, end_x, end_y, end_z)
-                t_end = min(t_brick, t_out)
-                plane_x, plane_y, plane_z = 1.0 * (cx + ahead_x), 1.0 * (cy + ahead_y), 1.0 * (cz + ahead_z)
-                at = ((cx & 3) << 4) | ((cy & 3) << 2) | (cz & 3)
-                while left != 0:
-                    # Ask the cubic in this cell, if it ranks high enough.
-                    sx, sy, sz = plane_x * ix + kx, plane_y * iy + ky, plane_z * iz + kz
-                    t_cell = max(t, min(sx, sy, sz))
-                    bit = ONE << np.uint64(at)
-                    if left & bit != 0:
-                        left ^= bit
-                        lx, ly, lz = plane_x - ahead_x, plane_y - ahead_y, plane_z - ahead_z
-                        corner = start + int(lx) * step_x + int(ly) * step_y + int(lz)
-                        ex = min(max(ux + t * dx - lx, 0.0), 1.0)
-                        ey = min(max(uy + t * dy - ly, 0.0), 1.0)
-                        ez = min(max(uz + t * dz - lz, 0.0), 1.0)
-                        root = root_in_cell(
-                            scene.values, corner, step_x, step_y, level, ex, ey, ez, dx, dy, dz, on_surface, t_cell - t
-                        )
-                        if root < np.inf:
-                            t += root
-                            return (t, SURFACE, -1) if t < limit else (np.inf, MISS, -1)
-                    on_surface = False
-                    t = t_cell
-                    if t >= t_end:
-                        break
-                    # Go to the next cell.
-                    on_x, on_y = first_of(sx, sy, sz)
-                    plane_x += along_x if on_x else 0.0
-                    plane_y += along_y if on_y else 0.0
-                    plane_z += 0.0 if on_x or on_y else along_z
-                    at += 16 * toward_x if on_x else (4 * toward_y if on_y else toward_z)
-            # Go to the next brick.
-            t, started, on_surface = max(t, t_brick), True, False
-            if t >= t_out:
-                return np.inf, MISS, -1
+                    c = cell_at(u, t, d, low, high)
+                left = cells_to_ask(bricks, brick, rank, c, cell_at(u, t_brick, d, low, high))
+                t, hit = hit_in_brick(
+                    scene.values, start, step_x, step_y, level, left, c, u, d, i, k, ahead, toward,
+                    t, min(t_brick, t_out), on_surface,
+                )  # fmt: skip
+                if hit:
+                    return (t, SURFACE, -1) if t < limit else (np.inf, MISS, -1)
+            t = max(t, t_brick)
             by_x, by_y = first_of(tx, ty, tz)
-            far_x += 4.0 * along_x if by_x else 0.0
-            far_y += 4.0 * along_y if by_y else 0.0
-            far_z += 0.0 if by_x or by_y else 4.0 * along_z
-            bx += toward_x if by_x else 0
-            by += toward_y if by_y else 0
-            bz += 0 if by_x or by_y else toward_z
-            brick += hop_x if by_x else (hop_y if by_y else hop_z)
-        else:
-            # Leap over the largest cube of empty bricks ahead.
-            if empty == 8:
-                return np.inf, MISS, -1
-            hop = REACH[empty - 1] - 1
-            up_x, up_y, up_z = hop * toward_x, hop * toward_y, hop * toward_z
-            tx = (far_x + 4.0 * up_x) * ix + kx
-            ty = (far_y + 4.0 * up_y) * iy + ky
-            tz = (far_z + 4.0 * up_z) * iz + kz
-            t, started, on_surface = max(t, min(tx, ty, tz)), True, False
-            if t >= t_out:
-                return np.inf, MISS, -1
-            by_x, by_y = first_of(tx, ty, tz)
-            far_end_x, far_end_y, far_end_z = bx + up_x, by + up_y, bz + up_z
-            mx = min(max(int(ux + t * dx) >> 2, min(bx, far_end_x)), max(bx, far_end_x))
-            my = min(max(int(uy + t * dy) >> 2, min(by, far_end_y)), max(by, far_end_y))
-            mz = min(max(int(uz + t * dz) >> 2, min(bz, far_end_z)), max(bz, far_end_z))
-            bx = far_end_x + toward_x if by_x else mx
-            by = far_end_y + toward_y if by_y else my
-            bz = mz if by_x or by_y else far_end_z + toward_z
-            brick = ((bx * many_y + by) * many_z + bz) << 7
-            far_x = 1.0 * ((bx + ahead_x) << BRICK_SHIFT)
-            far_y = 1.0 * ((by + ahead_y) << BRICK_SHIFT)
-            far_z = 1.0 * ((bz + ahead_z) << BRICK_SHIFT)
+            b = (
+                b[0] + (toward[0] if by_x else 0),
+                b[1] + (toward[1] if by_y else 0),
+                b[2] + (0 if by_x or by_y else toward[2]),
+            )
+        if t >= t_out:
+            return np.inf, MISS, -1
+        started, on_surface = True, False
+        brick = ((b[0] * many_y + b[1]) * many_z + b[2]) << 7
     return np.inf, MISS, -1
 
 
@@ -380,7 +421,7 @@ def march_from(scene, f, level, x, n, d, own, face, limit):
     ux = snap((x[0] - scene.origin[f, 0]) / sx)
     uy = snap((x[1] - scene.origin[f, 1]) / sy)
     uz = snap((x[2] - scene.origin[f, 2]) / sz)
-    return march(scene, f, level, ux, uy, uz, d[0] / sx, d[1] / sy, d[2] / sz, own, limit)
+    return march(scene, f, level, (ux, uy, uz), (d[0] / sx, d[1] / sy, d[2] / sz), own, limit)
 
 
 @jit
