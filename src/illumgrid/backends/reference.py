@@ -16,7 +16,7 @@ from illumgrid.constants import BURIED, CAP, LOST, MISS, NOWHERE, ON_A_VOXEL, ON
 from illumgrid.field.levelset import Marchable
 from illumgrid.field.lights import basis
 from illumgrid.field.scene import Scene
-from illumgrid.field.volume import Floats
+from illumgrid.field.volume import Floats, central_differences, unit
 from illumgrid.grid.channels import Channels
 from illumgrid.rng import draw, draw_pair, net_size, sharing, stream
 from illumgrid.stages import Backend, hookimpl
@@ -205,39 +205,19 @@ def nearest_hit(
 
 def gradient_normal(scene: Marchable, f: int, x: Floats) -> Floats:
     """Outward unit normals (n, 3) at frame points: central differences, interpolated; of the cell where they cancel."""
-    v, last = voxels(scene, f), scene.shape[f] - 1
-    u = (x - scene.origin[f]) / scene.spacing[f]
-    cell = np.clip(np.floor(u), 0, last - 1).astype(np.int64)
-    e = np.clip(u - cell, 0.0, 1.0)
-    gradient = np.zeros((len(x), 3))
-    for corner in _CORNERS:
-        weight = np.where(corner, e, 1 - e).prod(axis=1)
-        for axis in range(3):
-            after, before = cell + corner, cell + corner
-            after[:, axis] = np.minimum(after[:, axis] + 1, last[axis])
-            before[:, axis] = np.maximum(before[:, axis] - 1, 0)
-            rise = v[tuple(after.T)].astype(float) - v[tuple(before.T)]
-            gradient[:, axis] += weight * rise / (after - before)[:, axis]
+    gradient = central_differences(voxels(scene, f), (x - scene.origin[f]) / scene.spacing[f])
     known = gradient.any(axis=1, keepdims=True)
-    return np.where(known, outward(gradient / scene.spacing[f]), cell_normal(scene, f, x))
+    return np.where(known, unit(-gradient / scene.spacing[f]), cell_normal(scene, f, x))
 
 
 def cell_normal(scene: Marchable, f: int, x: Floats) -> Floats:
-    """Outward unit normals (n, 3) of the trilinear cells that hold frame points."""
+    """Outward unit normals (n, 3) of the trilinear cells that hold frame points: slopes of the cubic at its entry."""
     v, last = voxels(scene, f), scene.shape[f] - 1
     u = (x - scene.origin[f]) / scene.spacing[f]
     cell = np.clip(np.floor(u), 0, last - 1).astype(np.int64)
     steps = (np.tile(step, (len(x), 1)) for step in np.eye(3))
     slopes = [cubic(v, np.zeros(len(x)), cell, np.clip(u - cell, 0.0, 1.0), step)[:, 1] for step in steps]
-    return outward(np.stack(slopes, axis=1) / scene.spacing[f])
-
-
-def outward(gradient: Floats) -> Floats:
-    """Unit vectors (n, 3) against gradients; 0 where they are 0. Scaled first: a tiny slope's square underflows."""
-    largest = np.abs(gradient).max(axis=1, keepdims=True, initial=0.0)
-    gradient = gradient / np.where(largest > 0, largest, 1.0)
-    length = np.linalg.norm(gradient, axis=1, keepdims=True)
-    return -gradient / np.where(length > 0, length, 1.0)
+    return unit(-np.stack(slopes, axis=1) / scene.spacing[f])
 
 
 @dataclass(frozen=True)

@@ -228,13 +228,21 @@ def smooth(volume: Volume, sigma: float) -> Volume:
     return volume.with_values(gaussian_filter(volume.values, sigma, mode="nearest"))
 
 
-def cells(volume: Lattice, index: Floats) -> tuple[NDArray[np.int64], Floats]:
+class Shaped(Protocol):
+    """Points on three axes: a `Lattice`, or an array (nx, ny, nz)."""
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Number of points along x, y, z."""
+
+
+def cells(lattice: Shaped, index: Floats) -> tuple[NDArray[np.int64], Floats]:
     """Cell (n, 3) that contains each fractional index (n, 3), and the position within it, 0 to 1."""
-    cell = np.clip(np.floor(index), 0, np.array(volume.shape) - 2).astype(np.int64)
+    cell = np.clip(np.floor(index), 0, np.array(lattice.shape) - 2).astype(np.int64)
     return cell, np.clip(index - cell, 0.0, 1.0)
 
 
-def corners(lattice: Lattice, index: Floats) -> Iterator[tuple[NDArray[np.int64], Floats]]:
+def corners(lattice: Shaped, index: Floats) -> Iterator[tuple[NDArray[np.int64], Floats]]:
     """The eight lattice points (n, 3) around fractional indices (n, 3), one by one, with trilinear weights (n,)."""
     cell, f = cells(lattice, index)
     for corner in np.ndindex(2, 2, 2):
@@ -270,18 +278,34 @@ def cell_gradient(volume: Volume, index: Floats) -> Floats:
     return result / volume.spacing
 
 
-def smooth_gradient(volume: Volume, index: Floats) -> Floats:
-    """Central differences of the stored values, interpolated: (n, 3), per world unit, along the volume's axes."""
-    top = np.array(volume.shape) - 1
+def central_differences(values: NDArray[Any], index: Floats) -> Floats:
+    """Slopes (n, 3) per index step at fractional indices (n, 3): differences of neighbours, interpolated trilinearly.
+
+    They are one-sided at the border.
+    """
+    top = np.array(values.shape) - 1
     result = np.zeros((len(index), 3))
-    for voxel, weight in corners(volume, index):
+    for voxel, weight in corners(values, index):
         for axis in range(3):
             after, before = voxel.copy(), voxel.copy()
             after[:, axis] = np.minimum(voxel[:, axis] + 1, top[axis])
             before[:, axis] = np.maximum(voxel[:, axis] - 1, 0)
-            rise = volume.values[tuple(after.T)].astype(float) - volume.values[tuple(before.T)]
+            rise = values[tuple(after.T)].astype(float) - values[tuple(before.T)]
             result[:, axis] += weight * rise / (after[:, axis] - before[:, axis])
-    return result / volume.spacing
+    return result
+
+
+def smooth_gradient(volume: Volume, index: Floats) -> Floats:
+    """Central differences of the stored values, interpolated: (n, 3), per world unit, along the volume's axes."""
+    return central_differences(volume.values, index) / volume.spacing
+
+
+def unit(vectors: Floats) -> Floats:
+    """Vectors (n, 3) of length 1; 0 where they are 0. Scaled first: the square of a tiny gradient would underflow."""
+    largest = np.abs(vectors).max(axis=1, keepdims=True, initial=0.0)
+    vectors = vectors / np.where(largest > 0, largest, 1.0)
+    length = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return np.asarray(vectors / np.where(length > 0, length, 1.0))
 
 
 def outward_normals(volume: Volume, index: Floats, inside: Side) -> Floats:
@@ -293,12 +317,7 @@ def outward_normals(volume: Volume, index: Floats, inside: Side) -> Floats:
     flat = ~gradient.any(axis=1)
     if flat.any():
         gradient[flat] = cell_gradient(volume, index[flat])
-    gradient *= -UPWARD[inside]
-    # Scale first: the square of a tiny gradient would underflow.
-    largest = np.abs(gradient).max(axis=1, keepdims=True, initial=0.0)
-    gradient = gradient / np.where(largest > 0, largest, 1.0)
-    length = np.linalg.norm(gradient, axis=1, keepdims=True)
-    return gradient / np.where(length > 0, length, 1.0)
+    return unit(-UPWARD[inside] * gradient)
 
 
 _MET = 1e-10
