@@ -95,3 +95,27 @@ def test_without_boundaries_the_histogram_decides():
     volume = Volume(np.linspace(0, 1, 5**3).reshape(5, 5, 5))  # of equal slope everywhere
     low, _, why = suggest_range(volume)
     assert "Otsu" in why and low == pytest.approx(otsu_threshold(volume)) and boundaries(volume) == []
+
+
+def halo(opposite=False):
+    """Bodies of 100 to 200 in a haze that falls off like 1/r, up to 40, and is cut by the border: as around a cluster."""
+    values = 240.0 / (RADIUS + 4.0)
+    for k, place in enumerate(np.random.default_rng(1).uniform(-14, 14, (40, 3))):
+        values += 2 * (50 + 3 * k) * np.exp(-((GRID - place[:, None, None, None]) ** 2).sum(axis=0) / 5)
+    return Volume(-values if opposite else values)
+
+
+def test_the_range_leaves_haze_that_fills_the_border():
+    volume = halo()
+    low, high, _ = suggest_range(volume)
+    border = np.concatenate([np.take(volume.values, end, axis=axis).ravel() for axis in range(3) for end in (0, -1)])
+    assert (border > low).mean() < 0.06 and low < high < 0.8 * volume.values.max()
+    assert suggest_range(halo(opposite=True), "below")[:2] == pytest.approx((-high, -low), rel=1e-4)
+
+
+def test_a_crop_that_cuts_skin_keeps_it_in_the_range():
+    crop = Volume(head().values[12:36, 11:33, 10:30])  # tissue fills the border, air is in its corners alone
+    wide = Volume(head().values[6:42, 5:39, 4:36])
+    for volume in (crop, wide):
+        low, high, _ = suggest_range(volume)
+        assert low < 95 < high

@@ -93,7 +93,10 @@ def test_signs_are_noticed_where_both_mean_something():
     assert has_both_signs(orbital()) and has_both_signs(orbital().with_values(-orbital().values))
     noise = np.random.default_rng(0).normal(0, 0.01, (9, 9, 9))
     noise[4, 4, 4] = 1
-    for values in (noise, ball(9).values, np.abs(orbital().values)):
+    scan = np.random.default_rng(1).normal(50, 15, (12, 12, 12))  # muscle and fat in Hounsfield units, near 0
+    scan[:, :5] -= 150
+    scan[3:5, 6:9, 6:9], scan[7:9, 6:9, 6:9] = -1000, 1000  # between air and bone
+    for values in (noise, scan, ball(9).values, np.abs(orbital().values)):
         assert not has_both_signs(Volume(values))
 
 

@@ -241,7 +241,7 @@ def moments(worth, first, sky, lamplight, channel):
     as all lamps spread evenly.
     """
     count = worth.shape[0]
-    total, known, mean, brightest, at = 0.0, 0, 0.0, 0.0, 0
+    total, known, mean, brightest, at = 0.0, 0, 0.0, 0.0, np.int64(0)
     for i in range(count):
         mean += worth[i, channel] / count
         brightest = max(brightest, worth[i, channel])
@@ -272,14 +272,15 @@ def solve_queries(
         x, n = (point[i, 0], point[i, 1], point[i, 2]), (normal[i, 0], normal[i, 1], normal[i, 2])
         if n[0] == 0.0 and n[1] == 0.0 and n[2] == 0.0:
             continue
-        x, face = begin(scene, target[i], x, n)
-        if face == LOST or buried(scene, level[i], x, n, target[i]):
+        own = np.int64(target[i])  # one type of number throughout: each further one is compiled anew
+        x, face = begin(scene, own, x, n)
+        if face == LOST or buried(scene, level[i], x, n, own):
             continue
         key = stream(seed, ids[i])
         for k in range(count):
             if stop[0] != 0:
                 return
-            walk(scene, key, np.uint64(first + k), bounces, level[i], target[i], face, x, n, throughput, worth[k])
+            walk(scene, key, np.uint64(first + k), bounces, level[i], own, face, x, n, throughput, worth[k])
         for channel in range(worth.shape[1]):
             mean_worth, off = moments(worth, first, scene.usual[channel], scene.lamplight[channel], channel)
             mean[i, channel], m2[i, channel] = np.pi * mean_worth, np.pi**2 * off
@@ -292,17 +293,17 @@ def cast_rays(scene, level, origin, direction, on, t, number, what, normal):
 
     Rays from nowhere (`on` is -1) are those of a camera: they see the fronts of quads only.
     """
-    fields, none = scene.start.shape[0], (0.0, 0.0, 0.0)
+    fields, none, nowhere = scene.start.shape[0], (0.0, 0.0, 0.0), np.int64(NOWHERE)
     for i in range(origin.shape[0]):
         x, d = (origin[i, 0], origin[i, 1], origin[i, 2]), (direction[i, 0], direction[i, 1], direction[i, 2])
         through, start, passed = on, x, 0.0
-        t[i], number[i], what[i], face = nearest_hit(scene, level, x, none, d, on, NOWHERE)
+        t[i], number[i], what[i], face = nearest_hit(scene, level, x, none, d, on, nowhere)
         while on < 0 and what[i] == QUAD and dot(scene.quad_normal[number[i] - fields], d) >= 0.0:
             # A wall seen from behind is not there: go on from it.
             passed += t[i]
             through = number[i]
             start = (x[0] + passed * d[0], x[1] + passed * d[1], x[2] + passed * d[2])
-            t[i], number[i], what[i], face = nearest_hit(scene, level, start, none, d, through, NOWHERE)
+            t[i], number[i], what[i], face = nearest_hit(scene, level, start, none, d, through, nowhere)
         t[i] += passed
         if what[i] != MISS and what[i] != BURIED:
             hit = (x[0] + t[i] * d[0], x[1] + t[i] * d[1], x[2] + t[i] * d[2])

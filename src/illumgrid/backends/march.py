@@ -515,7 +515,7 @@ def in_solid(scene, f, level, x, n):
 @jit
 def stay(scene, own, x, n):
     """Queries lie on the trilinear set: nothing to do."""
-    return x, NOWHERE
+    return x, np.int64(NOWHERE)
 
 
 for _question, _answer in (

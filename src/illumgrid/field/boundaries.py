@@ -30,6 +30,7 @@ _BINS = 64  # of the density of the boundaries' values
 _INSIDE = 0.05  # of the span of the data, by which a range stays away from their ends
 _BALANCED = 0.3  # smaller over larger extreme of a field of both signs
 _SMALL = 0.1  # of the smaller extreme: most of the voxels of such a field are nearer to 0
+_HAZE, _CLEAR = 0.1, 0.05  # shares of the border that are solid at the middle of a range in haze, and where it clears
 
 
 def suggest_range(volume: Volume, inside: Side = "above") -> tuple[float, float, str]:
@@ -66,12 +67,16 @@ def suggest_magnitudes(volume: Volume) -> tuple[float, float, str]:
 
 
 def has_both_signs(volume: Volume) -> bool:
-    """Whether the finite values reach about as far below 0 as above, and most of them are near 0."""
+    """Whether the finite values reach about as far below 0 as above, and most of them are near 0, around which they peak.
+
+    Soft tissue in Hounsfield units, between air and bone, is near 0 as well, but peaks at fat or muscle.
+    """
     low, high = volume.extremes
     if not low < 0 < high or min(-low, high) < _BALANCED * max(-low, high):
         return False
     ends = volume.to_stored(np.array([-_SMALL, _SMALL]) * min(-low, high))
-    return bool(((volume.values > ends[0]) & (volume.values < ends[1])).mean() > 0.5)
+    counts, _ = np.histogram(volume.values, 21, np.sort(ends))
+    return bool(counts.sum() > 0.5 * volume.values.size and abs(int(np.argmax(counts)) - 10) <= 1)
 
 
 def _parts(volume: Volume, part: Callable[[Floats], Floats]) -> Volume:
@@ -104,12 +109,38 @@ def _suggest(volume: Volume, inside: Side) -> tuple[float, float, str]:
     outer, inner = np.clip(_around_a_boundary(_density(value), *ends), _INSIDE, 1 - _INSIDE)
     if _thickness(volume, _in_units(volume, inside, [0.5 * (outer + inner)])[0], inside) < _THIN:
         inner = min(inner, 2 * np.sqrt(outer * inner) - outer)
+    outer, inner = _out_of_haze(volume, inside, value, slope, (outer, inner))
     if inner - outer < _INSIDE:  # a step: its surfaces are the same
         outer, inner = np.clip(0.5 * (outer + inner) + 0.5 * _INSIDE * np.array([-1, 1]), 0, 1)
     at = [shown(x, volume.extremes, 3) for x in sorted(_in_units(volume, inside, _peaks(_density(value))))]
     low, high = sorted(_in_units(volume, inside, [outer, inner]))
     plural = "boundaries between classes of the data lie" if len(at) > 1 else "the boundary of the object lies"
     return low, high, f"{plural} around {', '.join(at)}, where surfaces are steep"
+
+
+def _out_of_haze(
+    volume: Volume, inside: Side, value: Floats, slope: Floats, ends: tuple[float, float]
+) -> tuple[float, float]:
+    """The range, or one that begins where the solid leaves the border of the volume, if at its middle it still fills it.
+
+    A field of one class that thins out in all directions, as density does around a cluster of galaxies, has most of its
+    boundaries in the haze, which the border cuts; what people look for are the bodies within. Fields of several classes
+    are left as they are: a crop may cut skin.
+    """
+    faces = [np.take(volume.values, end, axis=axis).ravel() for axis in range(3) for end in (0, -1)]
+    low, high = (float(x) for x in (volume.values.min(), volume.values.max()))
+    share = (np.concatenate(faces).astype(float) - low) / (high - low)
+    border = share if UPWARD[inside] > 0 else 1 - share
+    clear = float(np.quantile(border, 1 - _CLEAR))
+    if (border >= 0.5 * sum(ends)).mean() < _HAZE or len(_peaks(_density(value))) > 1 or clear > 1 - 2 * _INSIDE:
+        return ends
+    within = value > clear
+    if within.sum() < _FEWEST:
+        return ends
+    order = np.argsort(value[within], kind="stable")
+    upto = np.cumsum(slope[within][order])
+    inner = float(value[within][order][np.searchsorted(upto, _INNER * upto[-1])])
+    return clear, min(inner, 1 - _INSIDE)
 
 
 def boundaries(volume: Volume, inside: Side = "above") -> list[float]:

@@ -10,7 +10,7 @@ from illumgrid.field.scene import Field, Material
 from illumgrid.field.volume import Volume
 
 POSITIVE, NEGATIVE = COLOURS[1], COLOURS[2]
-"""Albedos of h >= c and of h <= -c: vermilion and blue."""
+"""Albedos of h >= c and of h <= -c: orange and sky blue."""
 
 
 def without_gaps(volume: Volume) -> Volume:
@@ -36,7 +36,7 @@ def signed_pair(
     limits : (2,) array_like, optional
         Lowest and highest c, both positive, at t = 0 and 1; by default those of `suggest_magnitudes`.
     material : Material, optional
-        Of both; by default vermilion for positive and blue for negative.
+        Of both; by default orange for positive and sky blue for negative.
 
     Raises
     ------
