@@ -67,7 +67,7 @@ def suggest_magnitudes(volume: Volume) -> tuple[float, float, str]:
 
 
 def has_both_signs(volume: Volume) -> bool:
-    """Whether the finite values reach about as far below 0 as above, and most of them are near 0, around which they peak.
+    """Whether the finite values reach about as far below 0 as above, and most are near 0 and peak there.
 
     Soft tissue in Hounsfield units, between air and bone, is near 0 as well, but peaks at fat or muscle.
     """
@@ -75,7 +75,7 @@ def has_both_signs(volume: Volume) -> bool:
     if not low < 0 < high or min(-low, high) < _BALANCED * max(-low, high):
         return False
     ends = volume.to_stored(np.array([-_SMALL, _SMALL]) * min(-low, high))
-    counts, _ = np.histogram(volume.values, 21, np.sort(ends))
+    counts, _ = np.histogram(volume.values, 21, (float(ends.min()), float(ends.max())))
     return bool(counts.sum() > 0.5 * volume.values.size and abs(int(np.argmax(counts)) - 10) <= 1)
 
 
@@ -121,7 +121,7 @@ def _suggest(volume: Volume, inside: Side) -> tuple[float, float, str]:
 def _out_of_haze(
     volume: Volume, inside: Side, value: Floats, slope: Floats, ends: tuple[float, float]
 ) -> tuple[float, float]:
-    """The range, or one that begins where the solid leaves the border of the volume, if at its middle it still fills it.
+    """The range, or one that begins where the solid leaves the border, if at the middle it still fills much of it.
 
     A field of one class that thins out in all directions, as density does around a cluster of galaxies, has most of its
     boundaries in the haze, which the border cuts; what people look for are the bodies within. Fields of several classes
