@@ -44,6 +44,15 @@ def test_the_stages_of_the_page_run_by_name(installed):
     assert (light.grids[0].support > 0).any()
 
 
+@pytest.mark.parametrize(("kind", "name"), [("sampler", "chance"), ("backend", "hemisphere"), ("interpolator", "bins")])
+def test_the_modules_of_the_page_are_what_the_command_writes(call, tmp_path, kind, name):
+    assert "next: pip install -e new" in call("plugins", "--new", name, kind, "new")
+    for module in (f"illumgrid_{name}", f"test_{name}"):
+        assert f"# {module}.py\n{(tmp_path / 'new' / f'{module}.py').read_text('utf-8')}" == MODULES[module]
+    if kind == "sampler":
+        assert f"```toml\n{(tmp_path / 'new' / 'pyproject.toml').read_text('utf-8')}```" in PAGE
+
+
 @pytest.mark.parametrize("name", [name for name in MODULES if name.startswith("test_")])
 def test_the_suites_of_the_page_pass(installed, name):
     module = importlib.import_module(name)
@@ -61,6 +70,12 @@ def test_the_project_file_of_the_page_names_the_module_of_the_page():
     (text,) = re.findall(r"```toml\n(.*?)```", PAGE, re.DOTALL)
     project = tomllib.loads(text)
     assert set(project["project"]["entry-points"]["illumgrid"].values()) <= set(MODULES)
+
+
+def test_the_present_contract_has_a_row_on_the_page():
+    rows = re.findall(r"^\| (\d+) \|", PAGE, re.MULTILINE)
+    assert list(map(int, rows)) == list(range(1, stages.CONTRACT + 1))
+    assert f"This version of illumgrid is {stages.CONTRACT} " in PAGE
 
 
 def test_every_hook_and_every_argument_is_on_the_page():

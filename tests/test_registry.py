@@ -112,6 +112,27 @@ def test_a_strangers_stage_is_found_and_its_options_are_read(install):
 
 
 @pytest.mark.parametrize(
+    ("contract", "words"),
+    [
+        ("1", ""),
+        ("2", ""),
+        ("3", "written for contract 3; expected 1 to 2, which this version of illumgrid runs; upgrade illumgrid"),
+        ("0", "written for contract 0; expected 1 to 2, which this version of illumgrid runs; upgrade the plugin"),
+        ("'two'", "contract is 'two'; expected a version, such as 2"),
+    ],
+)
+def test_a_stage_of_a_contract_that_is_not_run_is_refused_in_a_sentence(install, contract, words):
+    source = SAMPLER.replace("NAME", "mine")
+    install("stranger", source.replace("    way:", f"    contract: ClassVar = {contract}\n    way:"))
+    found = messages()
+    assert len(found) == bool(words) and all(words in text and "stranger 1.0" in text for text in found)
+    if words:
+        refused(lambda: ig.sampler("mine"), "no sampler is named 'mine'")
+    else:
+        assert registry.entry("sampler", "mine").contract == int(contract)
+
+
+@pytest.mark.parametrize(
     "value, kind, words",
     [
         ("maybe", bool, "true or false"),
@@ -281,7 +302,7 @@ def test_the_list_of_plugins_shows_options_origins_and_what_is_missing(install, 
     install("stranger", STAGE.replace("    def queries", f"{method}    def queries"), "2.5")
     said = call("plugins")
     for words in (
-        "mine         stranger 2.5; not available here: pip install ray",
+        "mine         stranger 2.5, contract 1; not available here: pip install ray",
         "way   slow|quick   slow     How\n",
         "at    float,float  0.0,1.0  Where it is; in two lines\n",
         "uniform      illumgrid",

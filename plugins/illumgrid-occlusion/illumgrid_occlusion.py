@@ -59,6 +59,7 @@ class Occlusion:
     """
 
     name: ClassVar[str] = "occlusion"
+    contract: ClassVar[int] = 2
     geometry: ClassVar[str] = "levelset"
     transport: ClassVar[bool] = False
     radius: float = 8.0

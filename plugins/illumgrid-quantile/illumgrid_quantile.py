@@ -19,6 +19,7 @@ class Quantile:
     """
 
     name: ClassVar[str] = "quantile"
+    contract: ClassVar[int] = 2
     count: int = 32
 
     def queries(self, scene, specs, seed):

@@ -1,6 +1,7 @@
 """All that the author of a stage imports: the Protocols, the hooks, and the types that they speak of."""
 
 from illumgrid.transport.stages import (
+    CONTRACT,
     Backend,
     GridSpec,
     IlluminationGrid,
@@ -17,6 +18,7 @@ from illumgrid.transport.stages import (
 )
 
 __all__ = [
+    "CONTRACT",
     "Backend",
     "GridSpec",
     "IlluminationGrid",

@@ -20,7 +20,7 @@ from illumgrid import stages
 from illumgrid.errors import BadInput, tell
 from illumgrid.registry import options
 from illumgrid.stages import Backend, Interpolator, Sampler
-from illumgrid.transport.stages import Capabilities, capabilities
+from illumgrid.transport.stages import CONTRACT, OLDEST_CONTRACT, Capabilities, capabilities
 
 OWN = (
     "samplers.direct",
@@ -94,6 +94,11 @@ class Entry:
     package: str
     version: str
 
+    @property
+    def contract(self) -> int:
+        """Version of the contract that the stage was written for; 1 if it does not say."""
+        return int(getattr(self.stage, "contract", 1))
+
     def missing(self) -> str | None:
         """None if the stage can run here, otherwise the remedy."""
         ask = getattr(self.stage, "available", lambda: None)
@@ -147,6 +152,15 @@ def _fault(kind: str, stage: Any) -> str | None:
         return f"{what} is not a frozen dataclass; expected @dataclass(frozen=True) above the class"
     if not (isinstance(name, str) and re.fullmatch(r"[A-Za-z0-9][\w-]*", name)) or name == "auto":
         return f"{what}.name is {name!r}; expected a word of letters, digits, - and _ other than auto"
+    written_for = getattr(stage, "contract", 1)
+    if not isinstance(written_for, int) or isinstance(written_for, bool):
+        return f"{what}.contract is {written_for!r}; expected a version, such as {CONTRACT}"
+    if not OLDEST_CONTRACT <= written_for <= CONTRACT:
+        todo = "upgrade illumgrid" if written_for > CONTRACT else "upgrade the plugin"
+        return (
+            f"{what} was written for contract {written_for}; expected {OLDEST_CONTRACT} to {CONTRACT}, "
+            f"which this version of illumgrid runs; {todo}"
+        )
     if not callable(method):
         return f"{what} has no method {KINDS[kind].method}; expected that of a {kind}"
     try:

@@ -4,6 +4,9 @@ A stage is a frozen dataclass with a class attribute ``name``; its fields are it
 bool, int, float, str, a ``Literal`` of words, or a tuple of numbers. It may have a class method ``available``, which
 returns None if the stage can run, and otherwise the remedy, such as ``"pip install embreex"``.
 
+A stage names the version of these requirements that it was written for by the class attribute ``contract``: see
+`CONTRACT`.
+
 A package provides stages by hooks, functions marked with `hookimpl`, in the module named by its entry point in the
 group ``illumgrid``.
 """
@@ -24,6 +27,7 @@ from illumgrid.grid import GridSpec, IlluminationGrid, Nodes
 from illumgrid.transport.samples import Queries, Samples
 
 __all__ = [
+    "CONTRACT",
     "Backend",
     "GridSpec",
     "IlluminationGrid",
@@ -35,6 +39,12 @@ __all__ = [
     "hookimpl",
     "on_level_sets",
 ]
+
+CONTRACT, OLDEST_CONTRACT = 2, 1
+"""Version of what stages and the package agree upon, and the oldest that still runs: docs/plugins.md has their history.
+
+A stage says by its class attribute ``contract`` for which version it was written; without one, for the first.
+"""
 
 hookimpl = pluggy.HookimplMarker("illumgrid")
 """Marks a function as one of the hooks below, selected by the function's name."""
