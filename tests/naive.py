@@ -410,8 +410,11 @@ def is_hole(scene, query):
     return not any(at.normal) or any(Solid(scene, query.level[0], k).holds(at.x) for k in others)
 
 
-def path_worth(scene, query, path, bounces, seed):
-    """Radiance (3,) that one path contributes to a query (a `Queries` of length 1 that is not a hole)."""
+def path_worth(scene, query, path, bounces, seed, known=None):
+    """Radiance (3,) that one path contributes to a query (a `Queries` of length 1 that is not a hole).
+
+    `known` is (grids, walls, alike), in which it may end: see `cached`.
+    """
     with np.errstate(over="ignore"):
         key = stream(np.uint64(seed), query.id[0])
         u = [[float(c) for c in draw_pair(key, np.uint64(path), np.uint64(k))] for k in range(bounces + 1)]
@@ -433,7 +436,47 @@ def path_worth(scene, query, path, bounces, seed):
         emission, albedo = surface(scene, hit, start, d)
         worth = worth + throughput * emission
         throughput = throughput * albedo
+        if known and k < bounces and (light := cached(scene, query.level[0], hit, start, d, *known)) is not None:
+            return worth + throughput * light / math.pi
     return worth
+
+
+def cached(scene, levels, hit, start, d, grids, walls, alike):
+    """Irradiance (3,) that grids and walls hold where a ray from `start` along d met a surface; None to go on."""
+    places = [float(field.place(level)) for field, level in zip(scene.fields, levels)]
+    if max(places) - min(places) > 1e-6 or min(places) < -1e-6 or max(places) > 1 + 1e-6:
+        return None  # no row of the sweep
+    if hit.cap or (hit.t == 0 and hit.field == start.field):
+        return None
+    if hit.field < len(scene.fields):
+        grid = grids[hit.field]
+        away = np.linalg.inv(grid.spec.direction) @ (scene.from_frame(hit.x) - grid.spec.origin)
+        place, near = away / grid.spec.spacing, max(grid.spec.spacing)
+    else:
+        wall, grid = Wall(scene, hit.field - len(scene.fields)), walls[hit.field - len(scene.fields)]
+        if sum(a * b for a, b in zip(wall.normal, d)) >= 0:
+            return None
+        sides = np.array([wall.u, wall.v]).T
+        u, v = np.linalg.lstsq(sides, np.array(hit.x) - wall.corner, rcond=None)[0]
+        rows, nv, nu, _ = grid.values.shape
+        place = [places[0] * (rows - 1), v * nv - 0.5, u * nu - 0.5]
+        near = max(math.hypot(*wall.u) / nu, math.hypot(*wall.v) / nv)
+    if hit.t < near:
+        return None
+    support, light = np.asarray(grid.support), np.asarray(grid.values)
+    mean = np.mean([light[node].mean() for node in np.ndindex(support.shape) if support[node] > 0])
+    nodes = [()]
+    for p, n in zip(place, support.shape):
+        p = min(max(p, 0), n - 1)
+        below = math.floor(p)
+        nodes = [(*node, i) for node in nodes for i in ((below, 1 - p + below), (min(below + 1, n - 1), p - below))]
+    found = [light[tuple(i for i, _ in node)].astype(float) for node in nodes]
+    if not all(support[tuple(i for i, _ in node)] for node in nodes):
+        return None
+    shown = [one.mean() for one in found]
+    if max(shown) - min(shown) > alike * mean:
+        return None
+    return sum(math.prod(w for _, w in node) * one for node, one in zip(nodes, found))
 
 
 def distant(scene):

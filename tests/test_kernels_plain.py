@@ -13,6 +13,7 @@ from illumgrid.backends.reference import Reference
 from illumgrid.field.levelset import marchable, turned_levels
 from illumgrid.field.scene import Scene
 from illumgrid.field.volume import Volume, interpolate, outward_normals
+from illumgrid.grid.cache import NO_CACHE
 from transport import ALBEDO, colored, everywhere, furnace, linear, noise, on_sets, on_voxels, rotation, waves, worth
 
 pytestmark = pytest.mark.plain
@@ -247,7 +248,8 @@ def test_a_path_that_starts_inside_another_solid_is_worth_nothing():
     for path in range(5):
         key = np.uint64(7)
         start, light = (levels, 0, constants.NOWHERE, point, normal), np.ones(3)
-        kernels.walk(marchable(scene), key, np.uint64(path), 4, *start, np.ones(3), light)
+        scenery = marchable(scene), NO_CACHE, constants.OFF_SWEEP
+        kernels.walk(*scenery, key, np.uint64(path), 4, *start, np.ones(3), light)
         assert not light.any()
 
 

@@ -32,3 +32,9 @@ ON_A_WALL = 1e-10
 
 UNSEEN = 0.2
 """Share of the usual light that features too small for the paths may add or take: measured, docs/light_transport.md."""
+
+SAME_ROW = 1e-6
+"""Share of the sweep within which the levels of all fields belong to one row of it."""
+
+OFF_SWEEP = -1.0
+"""In place of a row's place in the sweep: the levels belong to no row."""

@@ -28,11 +28,12 @@ from illumgrid.errors import BadInput
 from illumgrid.field.levelset import Marchable
 from illumgrid.field.scene import Scene
 from illumgrid.field.volume import Floats
+from illumgrid.grid.cache import NO_CACHE, Cache
 from illumgrid.grid.channels import Channels
 from illumgrid.rng import stream
 from illumgrid.stages import Backend, hookimpl
 from illumgrid.transport.samples import Queries, Samples, in_frame, in_turn
-from illumgrid.transport.tracer import laid_out, solve_once
+from illumgrid.transport.tracer import laid_out, prepare, solve_once
 
 Cast = Callable[[int, Floats, Floats], tuple[Floats, Ints]]
 """First face of field f's mesh along frame rays (n, 3): distance and number in that mesh, each (n,); inf, -1: none."""
@@ -209,9 +210,10 @@ class EmbreeTracer:
     fields: Marchable
     meshes: Meshes
     threads: ThreadPoolExecutor
+    cache: Cache = NO_CACHE
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return self.backend.prepare, (self.scene,)
+        return prepare, (self.backend, self.scene, self.cache)
 
     @in_turn
     def solve(self, queries: Queries, *, paths: range, bounces: int, seed: int) -> Samples:
@@ -228,7 +230,7 @@ class EmbreeTracer:
             def chunk(surfaces: Casting, rows: Ints) -> None:
                 own = queries.target[rows].astype(np.int64)
                 light, spread, good = answer(
-                    surfaces, key[rows], level[rows], own, point[rows], normal[rows], paths, bounces
+                    surfaces, self.cache, key[rows], level[rows], own, point[rows], normal[rows], paths, bounces
                 )
                 mean[rows], m2[rows], count[rows] = light, spread, np.where(good, len(paths), 0)
 

@@ -9,7 +9,8 @@ import numpy as np
 from numba.extending import register_jitable
 
 from illumgrid import constants
-from illumgrid.backends import lights, march, simd, surfaces
+from illumgrid.backends import gathering, lights, march, simd, surfaces
+from illumgrid.backends.gathering import ends_in_cache, place_in_sweep
 from illumgrid.backends.lights import (
     cosine_direction,
     distant_density,
@@ -31,7 +32,7 @@ from illumgrid.rng import draw, draw_pair, mix, net_size, pascal, reverse, shari
 for _function in (mix, stream, draw, reverse, pascal, upward, draw_pair, net_size, sharing):
     register_jitable(_function)
 
-_SOURCES = lights, march, simd, surfaces, bvh, mesh_cast, constants
+_SOURCES = gathering, lights, march, simd, surfaces, bvh, mesh_cast, constants
 jit = cached(*_SOURCES, _nrt=False)  # as in `march`
 inlined = cached(*_SOURCES, _nrt=False, forceinline=True)
 
@@ -134,11 +135,11 @@ def light_asked(scene, choice, u, v, level, on, on_face, x, n):
 
 
 @jit
-def walk(scene, key, path, bounces, level, own, own_face, x, n, throughput, worth):
+def walk(scene, cache, place, key, path, bounces, level, own, own_face, x, n, throughput, worth):
     """One path from the frame point x, with normal n, on `own_face` of surface `own`: fills its `worth` (C,).
 
     The irradiance there is π times the mean over the paths. `throughput` (C,) is room for the share of the light that
-    comes back along the path.
+    comes back along the path. `place` is that of its levels in the sweep of the cache.
     """
     throughput[:], worth[:] = 1.0, 0.0
     on, on_face, fields = own, own_face, scene.start.shape[0]
@@ -188,6 +189,9 @@ def walk(scene, key, path, bounces, level, own, own_face, x, n, throughput, wort
         on, on_face = number, face
         if t > 0.0 or what == QUAD:
             x = (x[0] + t * d[0], x[1] + t * d[1], x[2] + t * d[2])
+            # End where the light is known.
+            if segment < bounces and ends_in_cache(scene, cache, place, number, what, t, x, d, throughput, worth):
+                break
             n = hit_normal(scene, number, what, face, x, d)
             if n[0] == 0.0 and n[1] == 0.0 and n[2] == 0.0:
                 break
@@ -260,7 +264,7 @@ def moments(worth, first, sky, lamplight, channel):
 
 @jit
 def solve_queries(
-    scene, ids, point, normal, level, target, first, bounces, seed, throughput, worth, mean, m2, paths, stop
+    scene, cache, ids, point, normal, level, target, first, bounces, seed, throughput, worth, mean, m2, paths, stop
 ):  # fmt: skip
     """Irradiance at queries in frame coordinates, from a path for each row of `worth`, from number `first` on.
 
@@ -276,11 +280,12 @@ def solve_queries(
         x, face = begin(scene, own, x, n)
         if face == LOST or buried(scene, level[i], x, n, own):
             continue
-        key = stream(seed, ids[i])
+        key, place = stream(seed, ids[i]), place_in_sweep(cache, level[i])
         for k in range(count):
             if stop[0] != 0:
                 return
-            walk(scene, key, np.uint64(first + k), bounces, level[i], own, face, x, n, throughput, worth[k])
+            at = (level[i], own, face, x, n)
+            walk(scene, cache, place, key, np.uint64(first + k), bounces, *at, throughput, worth[k])
         for channel in range(worth.shape[1]):
             mean_worth, off = moments(worth, first, scene.usual[channel], scene.lamplight[channel], channel)
             mean[i, channel], m2[i, channel] = np.pi * mean_worth, np.pi**2 * off

@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 from illumgrid.errors import BadInput
 from illumgrid.field.levelset import Marchable
 from illumgrid.field.scene import Scene
+from illumgrid.grid.cache import NO_CACHE, Cache
 from illumgrid.grid.channels import Channels
 from illumgrid.stages import Backend, hookimpl
 from illumgrid.transport.samples import Queries, Samples, in_frame, in_turn
-from illumgrid.transport.tracer import answered, laid_out, solve_once
+from illumgrid.transport.tracer import answered, laid_out, prepare, solve_once
 
 if TYPE_CHECKING:
     from illumgrid.backends.mesh.meshes import Meshes
@@ -77,9 +78,10 @@ class NumbaTracer:
     fields: Marchable
     meshes: "Meshes | None"
     threads: ThreadPoolExecutor
+    cache: Cache = NO_CACHE
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return self.backend.prepare, (self.scene,)
+        return prepare, (self.backend, self.scene, self.cache)
 
     @in_turn
     def solve(self, queries: Queries, *, paths: range, bounces: int, seed: int) -> Samples:
@@ -103,9 +105,9 @@ class NumbaTracer:
             # Random numbers wrap around and misses are infinite, on purpose; without the JIT NumPy would warn of it.
             with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
                 solve_queries(
-                    surfaces, queries.id[rows], point[rows], normal[rows], level[rows], queries.target[rows],
-                    paths.start, bounces, np.uint64(seed), np.empty(channels), np.empty((len(paths), channels)),
-                    light, spread, good, stop,
+                    surfaces, self.cache, queries.id[rows], point[rows], normal[rows], level[rows],
+                    queries.target[rows], paths.start, bounces, np.uint64(seed), np.empty(channels),
+                    np.empty((len(paths), channels)), light, spread, good, stop,
                 )  # fmt: skip
             mean[rows], m2[rows], count[rows] = light, spread, good
 

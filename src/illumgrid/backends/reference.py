@@ -12,11 +12,25 @@ from typing import ClassVar, Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from illumgrid.constants import BURIED, CAP, LOST, MISS, NOWHERE, ON_A_VOXEL, ON_A_WALL, QUAD, SURFACE, UNSEEN
+from illumgrid.constants import (
+    BURIED,
+    CAP,
+    LOST,
+    MISS,
+    NOWHERE,
+    OFF_SWEEP,
+    ON_A_VOXEL,
+    ON_A_WALL,
+    QUAD,
+    SAME_ROW,
+    SURFACE,
+    UNSEEN,
+)
 from illumgrid.field.levelset import Marchable
 from illumgrid.field.lights import basis
 from illumgrid.field.scene import Scene
 from illumgrid.field.volume import Floats, central_differences, unit
+from illumgrid.grid.cache import NO_CACHE, Cache
 from illumgrid.grid.channels import Channels
 from illumgrid.rng import draw, draw_pair, net_size, sharing, stream
 from illumgrid.stages import Backend, hookimpl
@@ -373,8 +387,47 @@ def light_asked(
     return weight, light
 
 
+def place_in_sweep(cache: Cache, level: Floats) -> Floats:
+    """Where in the sweep, 0 to 1, rows of levels (n, F) are; `OFF_SWEEP` where they are none of its rows."""
+    if not len(cache.start):
+        return np.full(len(level), OFF_SWEEP)
+    first, last = cache.sweep.T
+    share = (level - first) / (last - first)
+    on = (np.abs(share - share[:, :1]) <= SAME_ROW) & (share >= -SAME_ROW) & (share <= 1 + SAME_ROW)
+    return np.where(on.all(axis=1), np.clip(share[:, 0], 0, 1), OFF_SWEEP)
+
+
+def cached_light(
+    scene: Marchable, cache: Cache, place: Floats, number: Ints, what: Ints, t: Floats, x: Floats, d: Floats
+) -> tuple[Floats, Bools]:
+    """Cached irradiance (n, C) where rays met surfaces at x, and whether (n,) their paths end: `gathering`."""
+    light, ends = np.zeros((len(x), cache.light.shape[1])), np.zeros(len(x), bool)
+    fields = len(scene.start)
+    for lattice, (start, shape) in enumerate(zip(cache.start, cache.shape)):
+        here = (number == lattice) & (place != OFF_SWEEP) & (t >= cache.near[lattice])
+        if lattice < fields:
+            rows = np.flatnonzero(here & (what == SURFACE))
+            index = (x[rows] - cache.origin[lattice]) / cache.spacing[lattice]
+        else:
+            quad = lattice - fields
+            rows = np.flatnonzero(here & (what == QUAD) & (d @ scene.quad_normal[quad] < 0))
+            u, v = scene.quad_duals[quad] @ (x[rows] - scene.quad_corner[quad]).T
+            index = np.stack([place[rows] * (shape[0] - 1), v * shape[1] - 0.5, u * shape[2] - 0.5], axis=1)
+        index = np.clip(index, 0, shape - 1)
+        cell = index.astype(np.int64)
+        good = cache.trusted[start + np.ravel_multi_index(tuple(cell.T), tuple(shape))]
+        rows, cell, e = rows[good], cell[good], (index - cell)[good]
+        for corner in _CORNERS:
+            node = tuple(np.minimum(cell + corner, shape - 1).T)
+            weight = np.where(corner, e, 1 - e).prod(axis=1)
+            light[rows] += weight[:, None] * cache.light[start + np.ravel_multi_index(node, tuple(shape))]
+        ends[rows] = True
+    return light, ends
+
+
 def walk(
     surfaces: Surfaces,
+    cache: Cache,
     key: NDArray[np.uint64],
     path: NDArray[np.uint64],
     bounces: int,
@@ -390,6 +443,7 @@ def walk(
     """
     scene = surfaces.scene
     worth, keep = np.zeros((len(x), len(scene.background))), np.ones((len(x), len(scene.background)))
+    place = place_in_sweep(cache, level)
     x, normal, on, on_face = x.copy(), normal.copy(), own.astype(np.int64), own_face.copy()
     alive, fields = np.arange(len(x)), len(scene.start)
     for segment in range(bounces + 1):
@@ -442,7 +496,15 @@ def walk(
             here = np.flatnonzero(moved & (number == f))
             normal[alive[here]] = surfaces.normal(f, what[here], face[here], x[alive[here]], d[here])
         normal[alive[wall]] = -np.sign(approach)[:, None] * scene.quad_normal[quad]
-        alive = alive[normal[alive].any(axis=1)]
+
+        # End where the light is known.
+        goes_on = normal[alive].any(axis=1)
+        if segment < bounces and len(cache.start):
+            met = np.where(moved, what, MISS)
+            light, ends = cached_light(scene, cache, place[alive], number, met, t, x[alive], d)
+            worth[alive] += keep[alive] * light / np.pi
+            goes_on &= ~ends
+        alive = alive[goes_on]
     return worth
 
 
@@ -493,7 +555,7 @@ def spread(worth: Floats, first: int, sky: Floats, lamplight: Floats) -> Floats:
 
 
 def answer(
-    surfaces: Surfaces, key: NDArray[np.uint64], level: Floats, target: Ints, x: Floats, normal: Floats,
+    surfaces: Surfaces, cache: Cache, key: NDArray[np.uint64], level: Floats, target: Ints, x: Floats, normal: Floats,
     paths: range, bounces: int,
 ) -> tuple[Floats, Floats, Bools]:  # fmt: skip
     """Mean (n, C) and m2 (n, C) of the irradiance at queries in the frame, and which are no holes (n,).
@@ -513,8 +575,9 @@ def answer(
         block = np.tile(np.arange(paths.start, paths.stop, dtype=np.uint64), len(rows))
         with np.errstate(over="ignore"):  # the random numbers wrap around, on purpose
             light = walk(
-                surfaces, key[every], block, bounces, level[every], target[every], face[every], x[every], normal[every]
-            )
+                surfaces, cache, key[every], block, bounces, level[every], target[every], face[every], x[every],
+                normal[every],
+            )  # fmt: skip
         light = light.reshape(len(rows), len(paths), -1).swapaxes(0, 1)
         mean[rows] = np.pi * light.mean(axis=0)
         m2[rows] = np.pi**2 * spread(light, paths.start, surfaces.scene.usual, surfaces.scene.lamplight)
@@ -543,6 +606,7 @@ class ReferenceTracer:
     scene: Scene
     channels: Channels
     surfaces: Marching
+    cache: Cache = NO_CACHE
 
     @in_turn
     def solve(self, queries: Queries, *, paths: range, bounces: int, seed: int) -> Samples:
@@ -551,7 +615,7 @@ class ReferenceTracer:
         with np.errstate(over="ignore"):
             key = stream(np.uint64(seed), queries.id)
         target = queries.target.astype(np.int64)
-        mean, m2, good = answer(self.surfaces, key, level, target, point, normal, paths, bounces)
+        mean, m2, good = answer(self.surfaces, self.cache, key, level, target, point, normal, paths, bounces)
         count = np.where(good, len(paths), 0).astype(np.int32)
         return Samples(queries, mean.astype(np.float32), m2.astype(np.float32), count, self.channels)
 

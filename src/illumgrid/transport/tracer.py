@@ -2,11 +2,13 @@
 
 from collections.abc import Callable
 from contextvars import ContextVar
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol, cast
 
+from illumgrid.errors import BadInput
 from illumgrid.field.levelset import Marchable, marchable
 from illumgrid.field.scene import Scene
+from illumgrid.grid.cache import NO_CACHE, Cache
 from illumgrid.grid.channels import Channels, channels_of, columns_of
 from illumgrid.transport.samples import Queries, Samples
 from illumgrid.transport.stages import Backend
@@ -33,10 +35,45 @@ class _Unprepared:
         return self.backend.solve(self.scene, queries, paths=paths, bounces=bounces, seed=seed)
 
 
-def prepare(backend: Backend, scene: Scene) -> Tracer:
-    """Set up a scene for a backend; a backend without a method ``prepare`` is called by its ``solve``."""
+def prepare(backend: Backend, scene: Scene, cache: Cache = NO_CACHE) -> Tracer:
+    """Set up a scene for a backend; a backend without a method ``prepare`` is called by its ``solve``.
+
+    With a cache, paths end where it is trusted: see `ending_in`.
+    """
     own = getattr(backend, "prepare", None)
-    return cast(Tracer, own(scene)) if own else _Unprepared(backend, scene)
+    tracer = cast(Tracer, own(scene)) if own else _Unprepared(backend, scene)
+    return tracer if cache is NO_CACHE else ending_in(cache, tracer)
+
+
+def ending_in(cache: Cache, tracer: Tracer) -> Tracer:
+    """The same tracer, whose paths end where a cache is trusted: every later bounce for the price of a lookup.
+
+    A path that meets a surface before its last bounce ends there with albedo / π times the cached irradiance. It goes
+    on from caps, from the backs of walls, after rays shorter than the lattice's spacing, in cells that are not trusted,
+    and if its levels are none of the sweep. Light that reaches the path without a surface is unchanged, and so are the
+    random numbers: what it gathers is a function of cache, seed, query, path.
+
+    Parameters
+    ----------
+    cache : Cache
+        From `illumgrid.grid.cache.cache_of` for the tracer's scene, such as
+        ``cache_of(light.scene, light.grids, light.walls)``.
+    tracer : Tracer
+        From `prepare`.
+
+    Raises
+    ------
+    BadInput
+        If the tracer is one of a plugin that knows no cache.
+    """
+    if not hasattr(tracer, "cache"):
+        raise BadInput(
+            f"{type(tracer).__name__} follows paths to their ends only; expected the backend numba, embree or reference"
+        )
+    light = cache.light.view()
+    light.flags.writeable = False  # always, also in another process: otherwise Numba compiles for another type
+    ending: Tracer = replace(cast(Any, tracer), cache=cache._replace(light=light))
+    return ending
 
 
 def laid_out(scene: Scene) -> tuple[Channels, Marchable]:

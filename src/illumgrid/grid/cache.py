@@ -1,0 +1,109 @@
+"""Grids and walls as a cache: where a path that meets a surface may end, and take the light that is known there.
+
+G. J. Ward, F. M. Rubinstein and R. D. Clear, "A ray tracing solution for diffuse interreflection", SIGGRAPH 1988;
+J. Křivánek and P. Gautron, "Practical Global Illumination with Irradiance Caching", 2009.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from illumgrid.errors import BadInput
+from illumgrid.field.scene import Scene
+from illumgrid.field.volume import Floats
+from illumgrid.grid.channels import channels_of
+from illumgrid.grid.illumination import IlluminationGrid
+from illumgrid.grid.walls import WallTexture
+
+ALIKE = 0.5
+"""Spread of a cell's nodes, largest less smallest, over the mean light of the grid, above which paths go on."""
+
+
+class Cache(NamedTuple):
+    """Light at the nodes of lattices, one a field, then one a quad, laid out for kernels.
+
+    A wall's lattice has the axes row of the sweep, v, u. A cell is named by its lowest node.
+    """
+
+    light: NDArray[np.float32]  # (N, C) irradiance, all lattices one after the other, C order
+    trusted: NDArray[np.bool_]  # (N,) cells in which a path may end
+    start: NDArray[np.int64]  # (F + Q,) offset of each lattice; empty if there is no cache
+    shape: NDArray[np.int64]  # (F + Q, 3)
+    origin: Floats  # (F, 3) frame position of node 0
+    spacing: Floats  # (F, 3)
+    near: Floats  # (F + Q,) distance below which a ray is too short to end: neighbours would light themselves
+    sweep: Floats  # (F, 2) levels at the two ends of the sweep, turned and as stored
+
+
+NO_CACHE = Cache(
+    np.zeros((0, 1), np.float32), np.zeros(0, bool), np.zeros(0, np.int64), np.zeros((0, 3), np.int64),
+    np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros((0, 2)),
+)  # fmt: skip
+"""With it every path goes on to its end."""
+NO_CACHE.light.flags.writeable = False
+
+
+def cache_of(
+    scene: Scene, grids: Sequence[IlluminationGrid], walls: Sequence[WallTexture], alike: float = ALIKE
+) -> Cache:
+    """Lay out the light of a scene as a cache.
+
+    Cells with a hole, or whose nodes differ by more than `alike` of the mean light, are not trusted: there the light
+    is not continuous, or the lattice too coarse for it.
+
+    Parameters
+    ----------
+    scene : Scene
+    grids : sequence of IlluminationGrid
+        One a field, as baked for this scene.
+    walls : sequence of WallTexture
+        One a quad.
+    alike : float
+        Infinite to trust all cells without holes.
+
+    Raises
+    ------
+    BadInput
+        If grids or walls are not one for each field and quad of the scene, in its channels.
+    """
+    channels = channels_of(scene)
+    lattices: list[IlluminationGrid | WallTexture] = [*grids, *walls]
+    if (len(grids), len(walls)) != (len(scene.fields), len(scene.quads)):
+        raise BadInput(
+            f"{len(grids)} grids and {len(walls)} walls came as a cache; expected {len(scene.fields)} and "
+            f"{len(scene.quads)}, those of the scene"
+        )
+    for lattice in lattices:
+        if lattice.channels.names != channels.names:
+            raise BadInput(
+                f"the light of the cache has the channels {', '.join(lattice.channels.names)}; expected those of the "
+                f"scene: {', '.join(channels.names)}"
+            )
+    light = [lattice.light.reshape(-1, len(channels)) for lattice in lattices]
+    trusted = [_alike(grid.channels.shown(grid.light).mean(axis=-1), grid.support > 0, alike) for grid in grids]
+    trusted += [_alike(wall.channels.shown(wall.light).mean(axis=-1), wall.support > 0, alike) for wall in walls]
+    texel = [max(np.linalg.norm(q.edge_u) / q.texels[0], np.linalg.norm(q.edge_v) / q.texels[1]) for q in scene.quads]
+    return Cache(
+        light=light[0] if len(light) == 1 else np.concatenate(light),
+        trusted=np.concatenate([cells.reshape(-1) for cells in trusted]),
+        start=np.cumsum([0, *map(len, light)], dtype=np.int64)[:-1],
+        shape=np.array([lattice.light.shape[:3] for lattice in lattices], np.int64),
+        origin=np.ascontiguousarray(scene.to_frame([grid.spec.origin for grid in grids])),
+        spacing=np.array([grid.spec.spacing for grid in grids], float),
+        near=np.array([*(grid.spec.spacing.max() for grid in grids), *texel], float),
+        sweep=np.array([field.upward * field.volume.to_stored(field.sweep) for field in scene.fields], float),
+    )
+
+
+def _alike(light: NDArray[np.float32], lit: NDArray[np.bool_], alike: float) -> NDArray[np.bool_]:
+    """Cells (nx, ny, nz), named by their lowest node, whose nodes all have light, and much the same."""
+    low, high, good = light, light, lit
+    for axis in range(3):
+        ahead = np.minimum(np.arange(light.shape[axis]) + 1, light.shape[axis] - 1)
+        low = np.minimum(low, low.take(ahead, axis))
+        high = np.maximum(high, high.take(ahead, axis))
+        good = good & good.take(ahead, axis)
+    mean = float(light[lit].mean(dtype=float)) if lit.any() else 0.0
+    return np.asarray(good & (high - low <= alike * mean))
