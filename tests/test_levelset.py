@@ -5,8 +5,9 @@ import pytest
 from numba import typeof
 
 from illumgrid.field.bricks import lay_bricks
-from illumgrid.field.levelset import isosurface, marchable, off_the_data, turned, turned_levels
+from illumgrid.field.levelset import isosurface, marchable, off_the_data, turned_levels
 from illumgrid.field.scene import Field, Material, Scene
+from illumgrid.field.signed import signed_pair
 from illumgrid.field.volume import Volume, world_to_index
 from illumgrid.transport.samples import Queries, in_frame
 from shapes import DIRECTIONS, MIRRORED, ball, refused, sampled, sky
@@ -159,12 +160,6 @@ def test_an_isovalue_that_is_no_number_is_refused(level):
 # To march through
 
 
-@pytest.mark.parametrize("inside", ["above", "below"])
-def test_a_field_is_turned_so_that_its_solid_is_upward(inside):
-    volume = Volume(np.random.default_rng(0).normal(size=(6, 9, 4)))
-    assert np.array_equal(turned(volume, inside), volume.values * (1 if inside == "above" else -1))
-
-
 def test_two_fields_lie_one_after_the_other_in_the_frame_of_the_first():
     random = np.random.default_rng(0)
     one = Volume(random.random((5, 6, 7)), (1, 2, 3), UNEVEN, MIRRORED)
@@ -173,9 +168,9 @@ def test_two_fields_lie_one_after_the_other_in_the_frame_of_the_first():
     scene = Scene(fields, background=(0.4, 0.5, 0.6))
     layout = marchable(scene)
     for f, (volume, sign) in enumerate(((one, 1), (two, -1))):
-        size, bricks = volume.values.size, lay_bricks(turned(volume, fields[f].inside))
+        size, bricks = volume.values.size, lay_bricks(sign * volume.values)
         assert layout.shape[f].tolist() == list(volume.shape)
-        assert np.array_equal(layout.values[layout.start[f] :][:size], sign * volume.values.ravel())
+        assert np.array_equal(layout.values[layout.start[f] :][:size], volume.values.ravel()) and layout.sign[f] == sign
         records = layout.bricks[128 * layout.brick_start[f] :][: bricks.records.size]
         assert np.array_equal(records, bricks.records.ravel()) and np.array_equal(layout.steps[f], bricks.steps)
         assert layout.brick_shape[f].tolist() == list(bricks.shape)
@@ -185,7 +180,9 @@ def test_two_fields_lie_one_after_the_other_in_the_frame_of_the_first():
         assert np.array_equal(layout.emission[f], fields[f].material.emission)
     assert layout.background.tolist() == [0.4, 0.5, 0.6]
     assert turned_levels(scene, np.array([[2.0, 3.0]])).tolist() == [[2, -3]]
-    assert np.shares_memory(marchable(sky(one)).values, one.values)
+    assert np.shares_memory(marchable(sky(one, inside="below")).values, one.values)
+    signed = marchable(Scene(signed_pair("a", Volume(one.values - 0.5), (0.1, 0.4))))
+    assert signed.values.size == one.values.size and signed.start.tolist() == [0, 0] and signed.sign.tolist() == [1, -1]
 
 
 def test_queries_reach_a_backend_in_the_frame_with_levels_turned_up():

@@ -110,11 +110,19 @@ def test_a_direction_in_single_precision_becomes_exactly_orthonormal():
     assert np.array_equal(noise(direction=volume.direction).direction, volume.direction)
 
 
-@pytest.mark.parametrize("kind", ["bool", "uint8", "int16", "float16", "float64"])
-def test_any_real_values_become_read_only_singles(kind):
+@pytest.mark.parametrize(
+    ("kind", "kept"),
+    [
+        *((kind, kind) for kind in ("uint8", "int8", "uint16", "int16", "float32")),
+        *((">i2", "int16"), ("bool", "uint8"), ("float16", "float32"), ("int64", "float32"), ("float64", "float32")),
+    ],
+)
+def test_any_real_values_are_kept_read_only_in_their_type_or_as_singles(kind, kept):
     values = np.arange(8).reshape(2, 2, 2).astype(kind)
     volume = Volume(values)
-    assert volume.values.dtype == np.float32 and np.array_equal(volume.values, values.astype(np.float32))
+    assert volume.values.dtype == kept and np.array_equal(volume.values, values.astype(np.float32))
+    assert np.shares_memory(volume.values, values) == (kind == kept)
+    assert np.array_equal(Volume(values, slope=-2.0).in_units(Volume(values, slope=-2.0).values), -2.0 * values)
     for array in (volume.values, volume.origin, volume.spacing, volume.direction):
         assert not array.flags.writeable
     assert values.flags.writeable

@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from illumgrid.bake import shifted_seed
 from illumgrid.field.scene import Field, Scene
-from illumgrid.field.volume import Floats, cell_gradient, index_to_world, interpolate
+from illumgrid.field.volume import Floats, cell_gradient, index_to_world, interpolate, slabs
 from illumgrid.stages import on_level_sets
 from illumgrid.transport.samples import Queries, join_queries
 
@@ -70,10 +70,11 @@ def _cells_by_step(field: Field) -> tuple[NDArray[np.int64], Floats]:
     from scipy.ndimage import maximum_filter, minimum_filter
 
     lowest, highest = map(float, field.stored_range)
-    share = field.volume.values - lowest  # of this size there is one array, single like the field
-    share *= _STEPS / (highest - lowest)
-    np.clip(np.floor(share, out=share), -1, _STEPS, out=share)
-    step = share.astype(np.int8)
+    step = np.empty(field.volume.shape, np.int8)
+    for slab in slabs(step.shape):
+        share = field.volume.values[slab].astype(np.float32, copy=False) - lowest
+        share *= _STEPS / (highest - lowest)
+        step[slab] = np.clip(np.floor(share, out=share), -1, _STEPS, out=share)
     # Of the corners of each cell.
     low, high = (of(step, 2, origin=-1)[:-1, :-1, :-1] for of in (minimum_filter, maximum_filter))
     first, last = np.maximum(low, 0).reshape(-1), np.minimum(high, _STEPS - 1).reshape(-1)

@@ -1,7 +1,8 @@
 """Rays that march through trilinear fields: the level set itself.
 
-A field comes as {v >= level}: `Marchable` has turned it so. Index coordinates of field f are (x - origin[f]) /
-spacing[f] for x in the frame of the scene; t is world distance throughout.
+The solid of a field is {sign v >= level}: see `Marchable`. Index coordinates of field f are (x - origin[f]) /
+spacing[f] for x in the frame of the scene; t is world distance throughout. Values are of the type that the file has:
+arithmetic makes each a double.
 """
 
 import numpy as np
@@ -127,19 +128,19 @@ def next_root(q1, q2, q3, end):
 
 
 @inlined
-def cubic(values, corner, step_x, step_y, level, ex, ey, ez, dx, dy, dz):
-    """Coefficients of v - level along a ray through a trilinear cell, from its entry e in [0, 1]³.
+def cubic(values, sign, corner, step_x, step_y, level, ex, ey, ez, dx, dy, dz):
+    """Coefficients of sign v - level along a ray through a trilinear cell, from its entry e in [0, 1]³.
 
     `corner` is the flat number of the cell's first voxel. Parker et al., "Interactive ray tracing for isosurface
     rendering", IEEE Visualization 1998, with the interpolation nested so that equal values cancel exactly.
     """
-    f000 = values[corner] - level
-    f001 = values[corner + 1] - level
-    f010 = values[corner + step_y] - level
-    f011 = values[corner + step_y + 1] - level
+    f000 = sign * values[corner] - level
+    f001 = sign * values[corner + 1] - level
+    f010 = sign * values[corner + step_y] - level
+    f011 = sign * values[corner + step_y + 1] - level
     corner += step_x
-    x00, x01 = values[corner] - level - f000, values[corner + 1] - level - f001
-    x10, x11 = values[corner + step_y] - level - f010, values[corner + step_y + 1] - level - f011
+    x00, x01 = sign * values[corner] - level - f000, sign * values[corner + 1] - level - f001
+    x10, x11 = sign * values[corner + step_y] - level - f010, sign * values[corner + step_y + 1] - level - f011
     # Along x: four edges, linear in t.
     a00, a01, a10, a11 = f000 + x00 * ex, f001 + x01 * ex, f010 + x10 * ex, f011 + x11 * ex
     s00, s01, s10, s11 = x00 * dx, x01 * dx, x10 * dx, x11 * dx
@@ -221,9 +222,9 @@ def cells_to_ask(bricks, brick, rank, c, end):
 
 
 @inlined
-def root_in_cell(values, corner, step_x, step_y, level, ex, ey, ez, dx, dy, dz, on_surface, length):
+def root_in_cell(values, sign, corner, step_x, step_y, level, ex, ey, ez, dx, dy, dz, on_surface, length):
     """Distance to the solid within a cell, from the entry e on; inf if it is not met within `length`."""
-    q0, q1, q2, q3 = cubic(values, corner, step_x, step_y, level, ex, ey, ez, dx, dy, dz)
+    q0, q1, q2, q3 = cubic(values, sign, corner, step_x, step_y, level, ex, ey, ez, dx, dy, dz)
     if on_surface:
         return next_root(q1, q2, q3, length)
     if q0 >= 0.0:
@@ -284,7 +285,9 @@ def far_sides(b, ahead):
 
 
 @inlined
-def hit_in_brick(values, start, step_x, step_y, level, left, cell, u, d, i, k, ahead, toward, t, t_end, on_surface):
+def hit_in_brick(
+    values, sign, start, step_x, step_y, level, left, cell, u, d, i, k, ahead, toward, t, t_end, on_surface
+):  # fmt: skip
     """Follow a ray from cell to cell of a brick (Amanatides & Woo 1987), from `cell` at t on: (t, whether it hit).
 
     The cubic is asked in the cells `left` only, given as bits, none of which lies beyond t_end.
@@ -303,7 +306,7 @@ def hit_in_brick(values, start, step_x, step_y, level, left, cell, u, d, i, k, a
             ey = min(max(u[1] + t * d[1] - ly, 0.0), 1.0)
             ez = min(max(u[2] + t * d[2] - lz, 0.0), 1.0)
             root = root_in_cell(
-                values, corner, step_x, step_y, level, ex, ey, ez, d[0], d[1], d[2], on_surface, t_cell - t
+                values, sign, corner, step_x, step_y, level, ex, ey, ez, d[0], d[1], d[2], on_surface, t_cell - t
             )
             if root < np.inf:
                 return t + root, True
@@ -354,12 +357,12 @@ def march(scene, f, level, u, d, on_surface, limit):
         return np.inf, MISS, -1
 
     # In the solid already: at a cap, or buried.
-    step_y, start = scene.shape[f, 2], scene.start[f]
+    step_y, start, sign = scene.shape[f, 2], scene.start[f], scene.sign[f]
     step_x = step_y * scene.shape[f, 1]
     if not on_surface:
         corner = start + c[0] * step_x + c[1] * step_y + c[2]
         q0, _, _, _ = cubic(
-            scene.values, corner, step_x, step_y, level, p[0] - c[0], p[1] - c[1], p[2] - c[2], d[0], d[1], d[2]
+            scene.values, sign, corner, step_x, step_y, level, p[0] - c[0], p[1] - c[1], p[2] - c[2], d[0], d[1], d[2]
         )
         if q0 >= 0.0:
             return t, (CAP if face >= 0 else BURIED), face
@@ -390,7 +393,7 @@ def march(scene, f, level, u, d, on_surface, limit):
                     c = cell_at(u, t, d, low, high)
                 left = cells_to_ask(bricks, brick, rank, c, cell_at(u, t_brick, d, low, high))
                 t, hit = hit_in_brick(
-                    scene.values, start, step_x, step_y, level, left, c, u, d, i, k, ahead, toward,
+                    scene.values, sign, start, step_x, step_y, level, left, c, u, d, i, k, ahead, toward,
                     t, min(t_brick, t_out), on_surface,
                 )  # fmt: skip
                 if hit:
@@ -445,9 +448,9 @@ def cell_normal(scene, f, ux, uy, uz):
     step_y = scene.shape[f, 2]
     step_x = step_y * scene.shape[f, 1]
     here = scene.start[f] + cx * step_x + cy * step_y + cz
-    _, gx, _, _ = cubic(scene.values, here, step_x, step_y, 0.0, wx, wy, wz, 1.0, 0.0, 0.0)
-    _, gy, _, _ = cubic(scene.values, here, step_x, step_y, 0.0, wx, wy, wz, 0.0, 1.0, 0.0)
-    _, gz, _, _ = cubic(scene.values, here, step_x, step_y, 0.0, wx, wy, wz, 0.0, 0.0, 1.0)
+    _, gx, _, _ = cubic(scene.values, scene.sign[f], here, step_x, step_y, 0.0, wx, wy, wz, 1.0, 0.0, 0.0)
+    _, gy, _, _ = cubic(scene.values, scene.sign[f], here, step_x, step_y, 0.0, wx, wy, wz, 0.0, 1.0, 0.0)
+    _, gz, _, _ = cubic(scene.values, scene.sign[f], here, step_x, step_y, 0.0, wx, wy, wz, 0.0, 0.0, 1.0)
     return outward(gx / scene.spacing[f, 0], gy / scene.spacing[f, 1], gz / scene.spacing[f, 2])
 
 
@@ -477,6 +480,8 @@ def gradient_normal(scene, f, ux, uy, uz):
         gz += weight * (np.float64(v[here + after]) - v[here - before]) / (after + before)
     if gx == 0.0 and gy == 0.0 and gz == 0.0:
         return cell_normal(scene, f, ux, uy, uz)
+    sign = scene.sign[f]
+    gx, gy, gz = sign * gx + 0.0, sign * gy + 0.0, sign * gz + 0.0  # no -0, whose sign would turn a frame of axes
     return outward(gx / scene.spacing[f, 0], gy / scene.spacing[f, 1], gz / scene.spacing[f, 2])
 
 
@@ -507,8 +512,8 @@ def in_solid(scene, f, level, x, n):
     cx, cy, cz = min(int(ux), last_x - 1), min(int(uy), last_y - 1), min(int(uz), last_z - 1)
     step_y = scene.shape[f, 2]
     step_x = step_y * scene.shape[f, 1]
-    corner = scene.start[f] + cx * step_x + cy * step_y + cz
-    q0, _, _, _ = cubic(scene.values, corner, step_x, step_y, level, ux - cx, uy - cy, uz - cz, 0.0, 0.0, 0.0)
+    corner, sign = scene.start[f] + cx * step_x + cy * step_y + cz, scene.sign[f]
+    q0, _, _, _ = cubic(scene.values, sign, corner, step_x, step_y, level, ux - cx, uy - cy, uz - cz, 0.0, 0.0, 0.0)
     return q0 >= 0.0
 
 

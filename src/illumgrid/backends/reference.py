@@ -7,7 +7,7 @@ meet is handed in: the trilinear level set here, its mesh in `embree`.
 import math
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import ClassVar, Literal, Protocol
+from typing import Any, ClassVar, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,8 +66,8 @@ class Surfaces(Protocol):
         """Whether points x on other surfaces lie inside the solid of field f."""
 
 
-def voxels(scene: Marchable, f: int) -> NDArray[np.float32]:
-    """The values of field f, turned so that its solid is {v >= level}, axes x, y, z."""
+def voxels(scene: Marchable, f: int) -> NDArray[Any]:
+    """The values of field f, axes x, y, z."""
     nx, ny, nz = scene.shape[f]
     return np.asarray(scene.values[scene.start[f] : scene.start[f] + nx * ny * nz].reshape(nx, ny, nz))
 
@@ -79,9 +79,10 @@ def index_of(scene: Marchable, f: int, x: Floats) -> Floats:
     return np.asarray(np.where(np.abs(u - nearest) < ON_A_VOXEL, nearest, u))
 
 
-def cubic(v: NDArray[np.float32], level: Floats, cell: Ints, e: Floats, d: Floats) -> Floats:
-    """Coefficients (n, 4) of v - level along e + t d, local in the cell: three blends, each one degree higher."""
-    corners = v[tuple((cell[:, None, :] + _CORNERS).transpose(2, 0, 1))].astype(float) - level[:, None]
+def cubic(scene: Marchable, f: int, level: Floats, cell: Ints, e: Floats, d: Floats) -> Floats:
+    """Coefficients (n, 4) of sign v - level along e + t d, local in the cell: three blends, each one degree higher."""
+    value = voxels(scene, f)[tuple((cell[:, None, :] + _CORNERS).transpose(2, 0, 1))]
+    corners = scene.sign[f] * value - level[:, None]
     q: Floats = corners.reshape(-1, 2, 2, 2, 1)
     for axis in range(3):
         low, rise = q[:, 0], q[:, 1] - q[:, 0]
@@ -135,9 +136,11 @@ def rise_from_surface(q: Floats, end: Floats) -> Floats:
     return np.where(dips | flat, 0.0, t)
 
 
-def march(v: NDArray[np.float32], level: Floats, u: Floats, d: Floats, on_surface: Bools) -> tuple[Floats, Ints, Ints]:
-    """First meeting of rays u + t d, in index coordinates, with {v >= level}: (t, what, axis of a cap), each (n,)."""
-    n, last = len(u), np.array(v.shape) - 1
+def march(
+    scene: Marchable, f: int, level: Floats, u: Floats, d: Floats, on_surface: Bools
+) -> tuple[Floats, Ints, Ints]:
+    """First meeting of rays u + t d, in index coordinates, with {sign v >= level}: (t, what, axis of a cap), each (n,)."""
+    n, last = len(u), scene.shape[f] - 1
     t_hit, what, face = np.full(n, np.inf), np.full(n, MISS), np.full(n, -1)
     with np.errstate(divide="ignore", invalid="ignore"):
         to_low, to_high = -u / d, (last - u) / d
@@ -158,7 +161,7 @@ def march(v: NDArray[np.float32], level: Floats, u: Floats, d: Floats, on_surfac
     ray = np.flatnonzero((t <= far.min(axis=1)) & ((cell >= 0) & (cell < last)).all(axis=1))
 
     # A ray that comes from outside and starts in the solid meets a cap, or is buried.
-    solid = ray[(evaluate(cubic(v, level[ray], cell[ray], p[ray] - cell[ray], d[ray]), np.zeros(len(ray))) >= 0)]
+    solid = ray[(evaluate(cubic(scene, f, level[ray], cell[ray], p[ray] - cell[ray], d[ray]), np.zeros(len(ray))) >= 0)]
     solid = solid[~on_surface[solid]]
     t_hit[solid], what[solid], face[solid] = t[solid], np.where(entered[solid], CAP, BURIED), entry_axis[solid]
     ray = np.setdiff1d(ray, solid)
@@ -170,7 +173,7 @@ def march(v: NDArray[np.float32], level: Floats, u: Floats, d: Floats, on_surfac
         with np.errstate(divide="ignore", invalid="ignore"):
             planes = np.where(r == 0, np.inf, (c + (r > 0)) * (1 / r) - u[ray] / r)
         t_next = np.maximum(t[ray], planes.min(axis=1))
-        q = cubic(v, level[ray], c, np.clip(u[ray] + t[ray, None] * r - c, 0.0, 1.0), r)
+        q = cubic(scene, f, level[ray], c, np.clip(u[ray] + t[ray, None] * r - c, 0.0, 1.0), r)
         length = t_next - t[ray]
         root = np.where(q[:, 0] >= 0, 0.0, first_rise(q, length))
         if own[ray].any():
@@ -220,17 +223,18 @@ def nearest_hit(
 def gradient_normal(scene: Marchable, f: int, x: Floats) -> Floats:
     """Outward unit normals (n, 3) at frame points: central differences, interpolated; of the cell where they cancel."""
     gradient = central_differences(voxels(scene, f), (x - scene.origin[f]) / scene.spacing[f])
+    gradient = scene.sign[f] * gradient + 0.0  # no -0
     known = gradient.any(axis=1, keepdims=True)
     return np.where(known, unit(-gradient / scene.spacing[f]), cell_normal(scene, f, x))
 
 
 def cell_normal(scene: Marchable, f: int, x: Floats) -> Floats:
     """Outward unit normals (n, 3) of the trilinear cells that hold frame points: slopes of the cubic at its entry."""
-    v, last = voxels(scene, f), scene.shape[f] - 1
+    last = scene.shape[f] - 1
     u = (x - scene.origin[f]) / scene.spacing[f]
     cell = np.clip(np.floor(u), 0, last - 1).astype(np.int64)
     steps = (np.tile(step, (len(x), 1)) for step in np.eye(3))
-    slopes = [cubic(v, np.zeros(len(x)), cell, np.clip(u - cell, 0.0, 1.0), step)[:, 1] for step in steps]
+    slopes = [cubic(scene, f, np.zeros(len(x)), cell, np.clip(u - cell, 0.0, 1.0), step)[:, 1] for step in steps]
     return unit(-np.stack(slopes, axis=1) / scene.spacing[f])
 
 
@@ -247,7 +251,7 @@ class Marching:
         t, what, at = np.full(len(x), np.inf), np.full(len(x), MISS), np.full(len(x), NOWHERE)
         ray = np.flatnonzero(~(own & (face != NOWHERE)))
         start, step = index_of(self.scene, f, x[ray]), d[ray] / self.scene.spacing[f]
-        t[ray], what[ray], at[ray] = march(voxels(self.scene, f), level[ray], start, step, own[ray])
+        t[ray], what[ray], at[ray] = march(self.scene, f, level[ray], start, step, own[ray])
         return t, what, at
 
     def normal(self, f: int, what: Ints, face: Ints, x: Floats, d: Floats) -> Floats:
@@ -263,7 +267,7 @@ class Marching:
         """By the trilinear value, the border included."""
         u, last = index_of(self.scene, f, x), self.scene.shape[f] - 1
         cell = np.clip(np.floor(u), 0, last - 1).astype(np.int64)
-        q = cubic(voxels(self.scene, f), level, cell, u - cell, np.zeros_like(u))
+        q = cubic(self.scene, f, level, cell, u - cell, np.zeros_like(u))
         return np.asarray(((u >= 0) & (u <= last)).all(axis=1) & (q[:, 0] >= 0))
 
 

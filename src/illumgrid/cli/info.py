@@ -22,8 +22,9 @@ def histogram_line(volume: "Volume", width: int = 64) -> str:
     """Histogram of the finite values in a line of block characters; heights are logarithmic."""
     import numpy as np
 
-    finite = volume.values[np.isfinite(volume.values)]
-    counts, _ = np.histogram(finite, width, (np.float64(finite.min()), np.float64(finite.max())))
+    from illumgrid.field.volume import histogram
+
+    counts, _ = histogram(volume, width)
     height = np.log1p(counts) / max(np.log1p(counts.max()), 1e-9)
     marks = BLOCKS
     try:
@@ -100,15 +101,15 @@ def _describe_volume(source: str, limits: tuple[float, float] | None, inside: "S
         least, most, _ = suggest_magnitudes(volume)
         result(f"  both signs       run --signed --range {shown(least)} {shown(most)} lights the surfaces at +c and -c")
     field = Field(volume_name(source), volume, range=(low, high) if limits is None else limits, inside=inside)  # type: ignore[arg-type]
-    if flat := plateaus(volume):
-        flat.sort(key=lambda one: -one[1])
+    known = plateaus(volume)
+    if flat := sorted(known, key=lambda one: -one[1]):
         values = ", ".join(
             f"{shown(value, volume.extremes, 6)} ({share:.1%} of the cells)" for value, share, _ in flat[:6]
         )
         result(f"  plateaus         {values}{f', and {len(flat) - 6} more' if len(flat) > 6 else ''}")
     for at, what in critical_isovalues(field):
         result(f"  critical         {shown(at, field.range)}: {what}")
-    for finding in diagnose(field, nodes_over(volume)):
+    for finding in diagnose(field, nodes_over(volume), flat=known):
         tell(finding.name, finding.sentence)
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from illumgrid.errors import BadInput, shown
-from illumgrid.field.volume import UPWARD, Floats, Side, Volume, finite
+from illumgrid.field.volume import UPWARD, Floats, Side, Volume, finite, histogram, slabs
 
 _VOXELS = 1 << 22  # that are looked at, in slabs spread over the volume
 _SLAB, _MARGIN = 16, 4  # slices of a slab, and of what the blur needs around it
@@ -75,14 +75,18 @@ def has_both_signs(volume: Volume) -> bool:
     if not low < 0 < high or min(-low, high) < _BALANCED * max(-low, high):
         return False
     ends = volume.to_stored(np.array([-_SMALL, _SMALL]) * min(-low, high))
-    counts, _ = np.histogram(volume.values, 21, (float(ends.min()), float(ends.max())))
+    counts, _ = histogram(volume, 21, (float(ends.min()), float(ends.max())))
     return bool(counts.sum() > 0.5 * volume.values.size and abs(int(np.argmax(counts)) - 10) <= 1)
 
 
 def _parts(volume: Volume, part: Callable[[Floats], Floats]) -> Volume:
     """The volume with a function of h, 0 where h is not finite."""
-    h = np.nan_to_num(volume.in_units(volume.values.astype(float)), nan=0.0, posinf=0.0, neginf=0.0)
-    return replace(volume, values=part(h), slope=1.0, intercept=0.0)  # type: ignore[arg-type]  # it converts
+    plain = volume.slope == 1 and volume.intercept == 0
+    values = np.empty(volume.shape, np.float32 if plain else np.float64)
+    for slab in slabs(volume.shape):
+        h = volume.in_units(volume.values[slab].astype(values.dtype))
+        values[slab] = part(np.nan_to_num(h, nan=0.0, posinf=0.0, neginf=0.0))
+    return replace(volume, values=values, slope=1.0, intercept=0.0)
 
 
 def _on_one_side(volume: Volume, inside: Side) -> tuple[float, float, str]:
@@ -128,7 +132,7 @@ def _out_of_haze(
     are left as they are: a crop may cut skin.
     """
     faces = [np.take(volume.values, end, axis=axis).ravel() for axis in range(3) for end in (0, -1)]
-    low, high = (float(x) for x in (volume.values.min(), volume.values.max()))
+    low, high = (float(x) for x in volume.stored_extremes)
     share = (np.concatenate(faces).astype(float) - low) / (high - low)
     border = share if UPWARD[inside] > 0 else 1 - share
     clear = float(np.quantile(border, 1 - _CLEAR))
@@ -157,10 +161,8 @@ def otsu_threshold(volume: Volume, inside: Side = "above") -> float:
 
 
 def _varying(volume: Volume, inside: Side) -> Volume:
-    lowest, highest = np.float64(volume.values.min()), np.float64(volume.values.max())
-    if not (np.isfinite(lowest) and np.isfinite(highest)):
-        volume = finite(volume, inside)
-        lowest, highest = np.float64(volume.values.min()), np.float64(volume.values.max())
+    volume = finite(volume, inside)
+    lowest, highest = volume.stored_extremes
     if lowest == highest:
         raise BadInput(
             f"the values are all {volume.in_units(lowest):g}; expected a field that varies, or there is no isosurface"
@@ -170,7 +172,7 @@ def _varying(volume: Volume, inside: Side) -> Volume:
 
 def _in_units(volume: Volume, inside: Side, depth: Floats | list[float]) -> list[float]:
     """Isovalues at shares of the span of the data, which count inward."""
-    low, high = (float(x) for x in (volume.values.min(), volume.values.max()))
+    low, high = (float(x) for x in volume.stored_extremes)
     share = np.asarray(depth) if UPWARD[inside] > 0 else 1 - np.asarray(depth)
     return [float(x) for x in np.asarray(volume.in_units(low + share * (high - low)))]
 
@@ -180,7 +182,7 @@ def _slabs(volume: Volume, inside: Side) -> list[tuple[NDArray[np.float32], slic
     from scipy.ndimage import gaussian_filter
 
     v = volume.values
-    low, high = (float(x) for x in (v.min(), v.max()))
+    low, high = (float(x) for x in volume.stored_extremes)
     every = max(1, int(np.ceil(v.size / _VOXELS)))
     found = []
     for first in range(0, v.shape[0], _SLAB * every):
@@ -197,7 +199,7 @@ def _boundary_voxels(volume: Volume, inside: Side) -> tuple[Floats, Floats]:
     from scipy.ndimage import map_coordinates
 
     counts, depth = _histogram(volume, inside)
-    sign, (low, high) = UPWARD[inside], (float(x) for x in (volume.values.min(), volume.values.max()))
+    sign, (low, high) = UPWARD[inside], (float(x) for x in volume.stored_extremes)
     threshold = (_otsu(counts, depth) - min(sign * low, sign * high)) / (high - low)
     ground, value, slope, step = [], [], [], volume.spacing / volume.spacing.min()
     for part, counted in _slabs(volume, inside):
@@ -261,23 +263,24 @@ def _peaks(density: Floats) -> list[float]:
 
 def _thickness(volume: Volume, isovalue: float, inside: Side) -> float:
     """Share of the solid's voxels whose six neighbours belong to it, too; 1 without any."""
-    sign = UPWARD[inside]
-    solid = sign * volume.values >= sign * volume.to_stored(isovalue)
-    within = solid[1:-1, 1:-1, 1:-1]
-    total, deep = int(within.sum()), within.copy()
-    for axis in range(3):
-        for part in (slice(0, -2), slice(2, None)):
-            at = [slice(1, -1)] * 3
-            at[axis] = part
-            deep &= solid[tuple(at)]
-    return int(deep.sum()) / total if total else 1.0
+    level, total, deep = volume.to_stored(isovalue), 0, 0
+    for part in slabs((volume.shape[0] - 2, *volume.shape[1:])):
+        values = volume.values[part.start : part.stop + 2]
+        solid = values >= level if UPWARD[inside] > 0 else values <= level
+        within = solid[1:-1, 1:-1, 1:-1].copy()
+        total += int(np.count_nonzero(within))
+        for axis in range(3):
+            for side in (slice(0, -2), slice(2, None)):
+                at = [slice(1, -1)] * 3
+                at[axis] = side
+                within &= solid[tuple(at)]
+        deep += int(np.count_nonzero(within))
+    return deep / total if total else 1.0
 
 
 def _histogram(volume: Volume, inside: Side) -> tuple[NDArray[np.int64], Floats]:
     """Counts of voxels and the middles of the bins, upwards."""
-    # np.float64, not float: for float32 values NumPy would compute the edges in float32, too coarse far from 0.
-    ends = np.float64(volume.values.min()), np.float64(volume.values.max())
-    counts, edges = np.histogram(volume.values, 1024, ends)
+    counts, edges = histogram(volume, 1024)
     depth = 0.5 * (edges[1:] + edges[:-1])
     return (counts, depth) if UPWARD[inside] > 0 else (counts[::-1], -depth[::-1])
 

@@ -1,15 +1,17 @@
 """Where a field is empty, at every isovalue: what lets a ray leap.
 
-A field comes turned, as {v >= level}. Its values become ranks of one byte, and its cells are grouped into bricks of
-BRICK³. What can be skipped at one level is then found by comparing bytes: there is nothing to build for a new one.
+A field is turned: its solid is {sign v >= level}. Its values become ranks of one byte, and its cells are grouped into
+bricks of BRICK³. What can be skipped at one level is then found by comparing bytes: there is nothing to build for a new
+one.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from illumgrid.constants import BRICK, REACH
+from illumgrid.field.volume import AT_ONCE, slabs
 
 RANKS = 255
 """Steps from the lowest rank to the highest."""
@@ -31,22 +33,48 @@ class Bricks(NamedTuple):
     # cubes: (8, len(REACH)) the largest rank in the cube of so many bricks from here on; octants in C order, up is 1
 
 
-def lay_bricks(values: NDArray[np.float32]) -> Bricks:
-    """Ranks of the cells of a turned field, and of the cubes of bricks towards the eight octants."""
-    steps = _steps(values)
-    ranks: Bytes = np.searchsorted(steps, values.reshape(-1), side="right").astype(np.uint8).reshape(values.shape)
+def lay_bricks(values: NDArray[Any], sign: float = 1.0) -> Bricks:
+    """Ranks of the cells of a field turned by `sign`, and of the cubes of bricks towards the eight octants.
+
+    Slab by slab: beside the bricks nothing as large as the field is made.
+    """
+    steps = _steps(values, sign)
+    nx, ny, nz = (-(-int(n - 1) // BRICK) for n in values.shape)
+    shape = nx, ny, nz
+    records = _aligned(nx * ny * nz, BRICK**3 + 8 * len(REACH))
+    largest: Bytes = np.empty(shape, np.uint8)
+    of_value = _ranks_of_all(values.dtype, steps, sign)
+    for bricks in slabs((nx, *values.shape[1:]), AT_ONCE // BRICK):
+        voxels = values[bricks.start * BRICK : bricks.stop * BRICK + 1]
+        if of_value is None:
+            turned = voxels if sign > 0 else -voxels
+            ranks: Bytes = np.searchsorted(steps, turned.reshape(-1), side="right").astype(np.uint8)
+        else:
+            ranks = of_value[voxels.reshape(-1).view(f"u{voxels.itemsize}")]
+        cells = _cells(ranks.reshape(voxels.shape), (bricks.stop - bricks.start, ny, nz))
+        at = slice(bricks.start * ny * nz, bricks.stop * ny * nz)
+        records[at, : BRICK**3] = cells
+        largest[bricks] = cells.max(axis=1).reshape(-1, ny, nz)
+    _write_cubes(largest, records[:, BRICK**3 :].reshape(len(records), 8, len(REACH)))
+    return Bricks(steps, shape, records)
+
+
+def _ranks_of_all(kind: np.dtype[Any], steps: NDArray[np.float32], sign: float) -> Bytes | None:
+    """The rank of each number that values of 8 or 16 bits can be, by its bits."""
+    if kind.itemsize > 2:
+        return None
+    numbers = np.arange(1 << 8 * kind.itemsize, dtype=f"u{kind.itemsize}").view(kind)
+    return np.searchsorted(steps, np.float32(sign) * numbers.astype(np.float32), side="right").astype(np.uint8)
+
+
+def _cells(ranks: Bytes, shape: tuple[int, int, int]) -> Bytes:
+    """Of each brick (m, BRICK³): the largest rank at the corners of its cells, 0 beyond the border."""
     for axis in range(3):
         line = np.moveaxis(ranks, axis, 0)
         ranks = np.moveaxis(np.maximum(line[:-1], line[1:]), 0, axis)
-    nx, ny, nz = (-(-int(n) // BRICK) for n in ranks.shape)
-    shape = nx, ny, nz
     ranks = np.pad(ranks, [(0, m * BRICK - int(n)) for m, n in zip(shape, ranks.shape)])
     split = ranks.reshape(shape[0], BRICK, shape[1], BRICK, shape[2], BRICK)
-    cells = np.ascontiguousarray(split.transpose(0, 2, 4, 1, 3, 5)).reshape(-1, BRICK**3)
-    records = _aligned(len(cells), BRICK**3 + 8 * len(REACH))
-    records[:, : BRICK**3] = cells
-    records[:, BRICK**3 :] = _cubes(cells.max(axis=1).reshape(shape)).reshape(len(cells), -1)
-    return Bricks(steps, shape, records)
+    return np.ascontiguousarray(split.transpose(0, 2, 4, 1, 3, 5)).reshape(-1, BRICK**3)
 
 
 def _aligned(bricks: int, size: int) -> Bytes:
@@ -56,13 +84,13 @@ def _aligned(bricks: int, size: int) -> Bytes:
     return room[first : first + bricks * size].reshape(bricks, size)
 
 
-def _steps(values: NDArray[np.float32]) -> NDArray[np.float32]:
+def _steps(values: NDArray[Any], sign: float) -> NDArray[np.float32]:
     """Steps for the ranks: half of them equal shares of the voxels, half of them equal steps of the value.
 
     They lie an ulp above values: for data with few distinct values the ranks distinguish every level.
     """
     flat = values.reshape(-1)
-    found = np.unique(flat[:: max(1, flat.size >> 16)])
+    found = np.unique(np.float32(sign) * flat[:: max(1, flat.size >> 16)].astype(np.float32))
     if len(found) > RANKS:
         by_share = found[np.linspace(0, len(found) - 1, RANKS // 2).astype(int)]
         by_value = np.linspace(found[0], found[-1], RANKS - RANKS // 2, dtype=np.float32)
@@ -72,9 +100,8 @@ def _steps(values: NDArray[np.float32]) -> NDArray[np.float32]:
     return steps
 
 
-def _cubes(largest: Bytes) -> Bytes:
-    """Largest rank in the cubes of REACH bricks that begin at each brick, (bricks, 8, len(REACH))."""
-    out = np.zeros((largest.size, 8, len(REACH)), np.uint8)
+def _write_cubes(largest: Bytes, out: Bytes) -> None:
+    """Write the largest rank in the cubes of REACH bricks that begin at each brick, (bricks, 8, len(REACH))."""
     for octant in range(8):
         # Seen along the octant every axis goes up.
         turn = tuple(slice(None, None, 1 if octant >> (2 - axis) & 1 else -1) for axis in range(3))
@@ -84,7 +111,6 @@ def _cubes(largest: Bytes) -> Bytes:
             cube = _reaching(cube, side, reach)
             side = reach
             out[:, octant, k] = cube[turn].reshape(-1)
-    return out
 
 
 def _reaching(cube: Bytes, side: int, reach: int) -> Bytes:

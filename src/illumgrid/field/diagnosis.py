@@ -4,23 +4,29 @@ Critical isovalues are not findings: light jumps there in nature, too.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from illumgrid.constants import DENSITY
 from illumgrid.errors import shown, shown_range
+from illumgrid.field.coarse import block_means
 from illumgrid.field.labels import labels_in
 from illumgrid.field.lattice import GridSpec
 from illumgrid.field.scene import Field
-from illumgrid.field.volume import Floats, Volume, index_to_world, interpolate, outward_normals, smooth
+from illumgrid.field.volume import Floats, Volume, index_to_world, interpolate, outward_normals, slabs
 
 _PLATEAU = 27  # flat cells that hang together: fewer are what integers do at every maximum
 _LEVELS = 64  # isovalues at which components, cavities and tunnels are counted
 _COUNTED = ("components", "tunnels", "cavities")
 _SIDE = 64  # voxels along the longest axis of the field on which they are counted
 
+
+_LOOKED_AT = 1 << 24  # voxels of a field of which all are looked at; of a larger one only some, where that will do
+_BLOCK = 64  # voxels along a block of those
+_ENOUGH = 1 << 20  # pairs of voxels whose normals are compared
 
 _ROUGH = 0.5  # normals that turn this much from voxel to voxel are rough (see `turning`)
 _BLURS = (1.0, 1.5, 2.0, 3.0, 4.0)  # voxels; the first that leaves no rough normals is advised
@@ -52,83 +58,162 @@ class Finding:
     options: str = ""
 
 
-def plateaus(volume: Volume) -> list[tuple[float, float, Floats]]:
+Plateau = tuple[float, float, Floats]
+"""Value, share of all cells, and the world position (3,) of a cell of the largest piece."""
+
+
+def plateaus(volume: Volume) -> list[Plateau]:
     """Values on which the field is flat over `_PLATEAU` cells or more that hang together, lowest first.
 
     Returns
     -------
-    list of (value, share, place)
-        Share of all cells, and the world position (3,) of a cell of the largest piece.
+    list of Plateau
     """
-    from scipy.ndimage import label
-
     v = volume.values
-    x, y, z = v[1:] == v[:-1], v[:, 1:] == v[:, :-1], v[:, :, 1:] == v[:, :, :-1]
-    flat = z[:-1, :-1] & z[1:, :-1] & z[:-1, 1:] & z[1:, 1:] & y[:-1, :, :-1] & y[1:, :, :-1] & x[:, :-1, :-1]
-    if np.count_nonzero(flat) < _PLATEAU:
-        return []
-    del x, y, z
-    piece, _ = label(flat)
-    cells = np.flatnonzero(flat)
-    number = piece.reshape(-1)[cells]
-    size = np.bincount(number)
+    size, first = _flat_pieces(v)
     large = np.flatnonzero(size >= _PLATEAU)
-    first = cells[np.unique(number, return_index=True)[1]]  # by number of the piece, from 1 on
-    place = np.stack(np.unravel_index(first[large - 1], flat.shape), axis=1)
+    if not len(large):
+        return []
+    cells = (volume.shape[0] - 1, volume.shape[1] - 1, volume.shape[2] - 1)
+    place = np.stack(np.unravel_index(first[large], cells), axis=1)
     value = volume.in_units(v[tuple(place.T)].astype(float))
     found = []
     for level in np.unique(value):
         own = value == level
         at = index_to_world(volume, place[own][np.argmax(size[large[own]])][None] + 0.5)[0]
-        found.append((float(level), float(size[large[own]].sum() / flat.size), at))
+        found.append((float(level), float(size[large[own]].sum() / np.prod(cells, dtype=float)), at))
     return found
 
 
-def turning(volume: Volume, low: float, high: float) -> float:
+def _flat_pieces(v: NDArray[Any]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Cells in each piece of flat cells that hang together, and the flat number of its first; in the order of those.
+
+    Slab by slab: pieces that meet at the plane between two slabs are joined in the end.
+    """
+    from scipy.ndimage import label
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    sizes, firsts, joins = [], [], []
+    before, known, layer = np.zeros(0, np.int64), 0, (v.shape[1] - 1) * (v.shape[2] - 1)
+    for rows in slabs((v.shape[0] - 1, *v.shape[1:])):
+        flat = _flat_cells(v[rows.start : rows.stop + 1])
+        piece, count = label(flat)
+        cells = np.flatnonzero(flat)
+        number = piece.reshape(-1)[cells] - 1
+        first = np.empty(count, np.int64)
+        first[number[::-1]] = cells[::-1]  # of several that are written, the last remains
+        sizes.append(np.bincount(number, minlength=count))
+        firsts.append(first + rows.start * layer)
+        here = np.where(piece > 0, piece + (known - 1), -1)
+        if len(before):
+            both = (before >= 0) & (here[0] >= 0)
+            joins.append(np.stack([before[both], here[0][both]]))
+        before, known = here[-1], known + count
+    size, start = np.concatenate(sizes), np.concatenate(firsts)
+    pairs = np.concatenate([np.zeros((2, 0), np.int64), *joins], axis=1)
+    if not pairs.size:
+        return size, start
+    links = coo_array((np.ones(pairs.shape[1], bool), (pairs[0], pairs[1])), shape=(known, known))
+    count, whole = connected_components(links, directed=False)
+    earliest = np.full(count, np.iinfo(np.int64).max)
+    np.minimum.at(earliest, whole, start)
+    order = np.argsort(earliest)
+    return np.bincount(whole, size, count).astype(np.int64)[order], earliest[order]
+
+
+def _flat_cells(v: NDArray[Any]) -> NDArray[np.bool_]:
+    """Cells whose eight corners are equal."""
+    x, y, z = v[1:] == v[:-1], v[:, 1:] == v[:, :-1], v[:, :, 1:] == v[:, :, :-1]
+    flat: NDArray[np.bool_] = z[:-1, :-1] & z[1:, :-1]
+    for edges in (z[:-1, 1:], z[1:, 1:], y[:-1, :, :-1], y[1:, :, :-1], x[:, :-1, :-1]):
+        flat &= edges
+    return flat
+
+
+def turning(volume: Volume, low: float, high: float, blur: float = 0.0) -> float:
     """How much the normal turns from voxel to voxel on level sets of a range of stored values: its RMS, 2 sin(angle/2).
 
     It is what a grid of one node per voxel has to resolve: 0.1 on smooth fields, 0.8 on raw magnetic resonance images,
-    1.4 where neighbouring normals have nothing to do with each other. 0 where the range has no voxels.
+    1.4 where neighbouring normals have nothing to do with each other. 0 where the range has no voxels. A volume of more
+    than `_LOOKED_AT` voxels is looked at in blocks here and there, until they hold `_ENOUGH` pairs.
+
+    Parameters
+    ----------
+    volume : Volume
+    low, high : float
+        Stored values.
+    blur : float
+        Voxels by which a Gaussian blurs the field before.
     """
-    v = volume.values
-    near = (v >= low) & (v <= high)
-    total, pairs = 0.0, 0
-    # Slabs along x, overlapping by a voxel: bounds the memory.
-    for first in range(0, v.shape[0], 32):
-        slab = slice(max(first - 1, 0), first + 34)
-        if not near[slab].any():
-            continue
-        slopes = [np.gradient(v[slab], np.float32(step), axis=axis) for axis, step in enumerate(volume.spacing)]
-        gradient = np.stack(slopes, axis=-1)
-        length = np.linalg.norm(gradient, axis=-1)
-        on = near[slab] & (length > 0)
-        gradient /= np.where(length > 0, length, 1)[..., None]
-        start = first - slab.start
-        for axis in range(3):
-            one, other = [slice(start, start + 32), slice(None), slice(None)], [slice(None)] * 3
-            other[0] = slice(start, start + 32)
-            if axis == 0:
-                other[0] = slice(start + 1, start + 33)
-            else:
-                one[axis], other[axis] = slice(0, -1), slice(1, None)
-            a, b = gradient[tuple(one)], gradient[tuple(other)]
-            both = on[tuple(one)][: len(b)] & on[tuple(other)]
-            total += float(np.square(a[: len(b)][both] - b[both], dtype=np.float64).sum())
-            pairs += int(both.sum())
+    total, pairs, small = 0.0, 0, volume.values.size <= _LOOKED_AT
+    for block in _slabs_of(volume.shape) if small else _blocks_of(volume.shape):
+        more, count = _turning_in(volume, block, low, high, blur)
+        total, pairs = total + more, pairs + count
+        if pairs >= _ENOUGH and not small:
+            break
     return float(np.sqrt(total / pairs)) if pairs else 0.0
 
 
-def _reduced(volume: Volume, longest: int) -> Volume:
-    """The field on fewer voxels, blurred before so that nothing folds over; as it is where it is small."""
+def _slabs_of(shape: tuple[int, int, int]) -> Iterator[tuple[slice, ...]]:
+    for first in range(0, shape[0], 32):
+        yield slice(first, min(first + 32, shape[0])), slice(0, shape[1]), slice(0, shape[2])
+
+
+def _blocks_of(shape: tuple[int, int, int]) -> Iterator[tuple[slice, ...]]:
+    """Blocks of `_BLOCK`³ voxels, all of them, in the order of chance but the same each time."""
+    many = [-(-n // _BLOCK) for n in shape]
+    for number in np.random.default_rng(0).permutation(int(np.prod(many))):
+        at = np.unravel_index(number, many)
+        yield tuple(slice(int(k) * _BLOCK, min((int(k) + 1) * _BLOCK, n)) for k, n in zip(at, shape))
+
+
+def _turning_in(volume: Volume, block: tuple[slice, ...], low: float, high: float, blur: float) -> tuple[float, int]:
+    """Squared differences of normals, summed over neighbouring voxels of the range from a block on, and how many."""
+    from scipy.ndimage import gaussian_filter
+
+    v, around = volume.values, int(4 * blur + 0.5) + 1  # as far as the Gaussian reaches, and a voxel for the slopes
+    outer = tuple(slice(max(s.start - around, 0), s.stop + around + 1) for s in block)
+    part = v[outer]
+    if not blur and not ((part >= low) & (part <= high)).any():
+        return 0.0, 0
+    part = gaussian_filter(part, blur, output=np.float32, mode="nearest") if blur else part.astype(np.float32)
+    near = (part >= low) & (part <= high)
+    if not near.any():
+        return 0.0, 0
+    slopes = [np.gradient(part, np.float32(step), axis=axis) for axis, step in enumerate(volume.spacing)]
+    gradient = np.stack(slopes, axis=-1)
+    length = np.linalg.norm(gradient, axis=-1)
+    on = near & (length > 0)
+    gradient /= np.where(length > 0, length, 1)[..., None]
+    total, pairs = 0.0, 0
+    one = [slice(s.start - o.start, s.stop - o.start) for s, o in zip(block, outer)]
+    for axis in range(3):
+        other = list(one)
+        other[axis] = slice(one[axis].start + 1, one[axis].stop + 1)
+        b, found = gradient[tuple(other)], on[tuple(other)]
+        a = tuple(slice(s.start, s.start + n) for s, n in zip(one, found.shape))  # at the border there is one less
+        both = on[a] & found
+        total += float(np.square(gradient[a][both] - b[both], dtype=np.float64).sum())
+        pairs += int(both.sum())
+    return total, pairs
+
+
+def _reduced(volume: Volume, longest: int) -> NDArray[Any]:
+    """The values on fewer voxels, blurred before so that nothing folds over; as they are where they are few."""
     from scipy.ndimage import gaussian_filter, map_coordinates
 
     spec = GridSpec.over(volume, min(longest, max(volume.shape)))
     if spec.shape == volume.shape:
-        return volume
-    step = spec.spacing / volume.spacing
-    soft = gaussian_filter(volume.values, 0.5 * np.sqrt(np.maximum(step**2 - 1, 0)), mode="nearest")
+        return volume.values
+    factors = [max(1, n // (4 * m)) for n, m in zip(volume.shape, spec.shape)]
+    if volume.values.size > _LOOKED_AT and max(factors) > 1:
+        volume = block_means(replace(volume, slope=1.0, intercept=0.0), factors)
+    step = (np.array(volume.shape) - 1) / (np.array(spec.shape) - 1)
+    sigma = 0.5 * np.sqrt(np.maximum(step**2 - 1, 0))
+    soft = gaussian_filter(volume.values, sigma, output=np.float32, mode="nearest")
     index = np.meshgrid(*(np.arange(n) * s for n, s in zip(spec.shape, step)), indexing="ij")
-    return Volume(map_coordinates(soft, index, order=1, mode="nearest"), spec.origin, spec.spacing, spec.direction)
+    return np.asarray(map_coordinates(soft, index, order=1, mode="nearest"))
 
 
 def topology(solid: NDArray[np.bool_]) -> tuple[int, int, int]:
@@ -158,7 +243,7 @@ def critical_isovalues(field: Field) -> list[tuple[float, str]]:
     small = _reduced(field.volume, _SIDE)
     low, high = field.stored_range
     levels = np.linspace(low, high, _LEVELS)
-    numbers = [topology(field.solid(small.values, level)) for level in levels]
+    numbers = [topology(field.solid(small, level)) for level in levels]
     found = []
     for k in range(1, _LEVELS - 2):
         before, after = numbers[k - 1 : k + 1], numbers[k + 1 : k + 3]
@@ -172,9 +257,10 @@ def _below(share: float) -> str:
     return f"{share:.1%}" if share >= 0.001 else "less than 0.1 %"
 
 
-def _plateau(field: Field) -> Iterator[Finding]:
+def _plateau(field: Field, known: list[Plateau] | None) -> Iterator[Finding]:
     low, high = field.range
-    found = [flat for flat in plateaus(field.volume) if low <= flat[0] <= high]
+    known = plateaus(field.volume) if known is None else known
+    found = [flat for flat in known if low <= flat[0] <= high]
     if not found:
         return
     found.sort(key=lambda flat: -flat[1])
@@ -195,13 +281,14 @@ def floor_of(turn: float, density: float = 1.0) -> float:
 
 def _noise(field: Field, spec: GridSpec, smoothed: float) -> Iterator[Finding]:
     density = max(spec.shape) / max(field.volume.shape)
-    turn = turning(field.volume, *field.stored_range)
+    low, high = field.stored_range
+    turn = turning(field.volume, low, high)
     if turn < _ROUGH:
         return
     after = turn
     for sigma in (s for s in _BLURS if s > smoothed):  # of the data as they came: variances of blurs add up
-        blurred = smooth(field.volume, min(np.sqrt(sigma**2 - smoothed**2), max(field.volume.shape)))
-        after = turning(blurred, *field.stored_range)
+        more = min(float(np.sqrt(sigma**2 - smoothed**2)), max(field.volume.shape))
+        after = turning(field.volume, low, high, more)
         if after < _ROUGH or after >= _SOOTHED * turn:
             break
     if after < _SOOTHED * turn:
@@ -215,23 +302,37 @@ def _noise(field: Field, spec: GridSpec, smoothed: float) -> Iterator[Finding]:
         )
 
 
-def _crossings(values: NDArray[np.float32], isovalue: float, most: int) -> Floats:
+def _crossings(values: NDArray[Any], isovalue: np.float64, most: int) -> Floats:
     """Index coordinates (n, 3) of at most about `most` points where a level set crosses edges between voxels."""
-    found = []
-    solid = values >= isovalue
-    for axis in range(3):
-        line = np.moveaxis(solid, axis, 0)
-        edges = np.argwhere(line[1:] != line[:-1])
-        edges = edges[:: max(1, 3 * len(edges) // most)]
-        low = np.insert(edges[:, 1:], axis, edges[:, 0], axis=1)
-        before, after = values[tuple(low.T)], values[tuple((low + np.eye(3, dtype=int)[axis]).T)]
-        found.append(low + np.eye(3)[axis] * ((isovalue - before) / (after.astype(float) - before))[:, None])
+    parts = [slab for k, slab in enumerate(slabs(values.shape)) if k % max(1, values.size // _LOOKED_AT) == 0]
+    counts, found = np.zeros((len(parts), 3), np.int64), []
+    for k, slab in enumerate(parts):
+        for axis, crossed in enumerate(_crossed_edges(values, slab, isovalue)):
+            counts[k, axis] = np.count_nonzero(crossed)
+    stride = np.maximum(1, 3 * counts.sum(axis=0) // most)
+    for slab, passed in zip(parts, np.cumsum(counts, axis=0) - counts):
+        for axis, crossed in enumerate(_crossed_edges(values, slab, isovalue)):
+            edges = np.argwhere(np.moveaxis(crossed, axis, 0))[-passed[axis] % stride[axis] :: stride[axis]]
+            low = np.insert(edges[:, 1:], axis, edges[:, 0], axis=1)
+            low[:, 0] += slab.start
+            before, after = values[tuple(low.T)], values[tuple((low + np.eye(3, dtype=int)[axis]).T)]
+            share = (isovalue - before) / (after.astype(float) - before)
+            found.append(low + np.eye(3)[axis] * share[:, None])
     return np.concatenate(found)
+
+
+def _crossed_edges(values: NDArray[Any], slab: slice, isovalue: np.float64) -> Iterator[NDArray[np.bool_]]:
+    """Along each axis, the edges from the voxels of a slab on that a level set crosses."""
+    solid = values[slab.start : slab.stop + 1] >= isovalue
+    yield solid[1:] != solid[:-1]
+    solid = solid[: slab.stop - slab.start]
+    yield solid[:, 1:] != solid[:, :-1]
+    yield solid[:, :, 1:] != solid[:, :, :-1]
 
 
 def _thin(field: Field, spec: GridSpec) -> Iterator[Finding]:
     volume, middle = field.volume, float(np.mean(field.range))
-    index = _crossings(volume.values, float(volume.to_stored(middle)), 3000)
+    index = _crossings(volume.values, np.float64(volume.to_stored(middle)), 3000)
     if not len(index):
         return
     inward = -outward_normals(volume, index, field.inside)
@@ -269,10 +370,8 @@ def _border(field: Field) -> Iterator[Finding]:
 def _empty(field: Field) -> Iterator[Finding]:
     low, high = field.range
     levels = np.linspace(low, high, _LEVELS)
-    values = field.volume.values
-    counts, _ = np.histogram(values, np.concatenate([[-np.inf], field.volume.to_stored(levels), [np.inf]]))
-    below = np.cumsum(counts)[:-1]
-    smallest = np.minimum(below, values.size - below)
+    below = _below_each(field.volume, field.volume.to_stored(levels))
+    smallest = np.minimum(below, field.volume.values.size - below)
     bare = levels[smallest < _FEW]
     if len(bare):
         yield Finding(
@@ -280,6 +379,18 @@ def _empty(field: Field) -> Iterator[Finding]:
             f"isovalues from {shown(bare.min(), levels)} to {shown(bare.max(), levels)} of field {field.name!r} have "
             f"(nearly) no surface: fewer than {_FEW} voxels lie on one side; choose a --range that leaves them out",
         )
+
+
+def _below_each(volume: Volume, levels: Floats) -> NDArray[np.int64]:
+    """How many voxels lie below each of some stored levels, increasing."""
+    if volume.values.dtype.kind != "f":
+        values, counts = volume.tally
+        return np.concatenate([[0], np.cumsum(counts)])[np.searchsorted(values, levels)]
+    upto = np.zeros(len(levels) + 1, np.int64)
+    for slab in slabs(volume.shape):
+        reached = np.searchsorted(levels, volume.values[slab].reshape(-1), side="right")
+        upto += np.bincount(reached, minlength=len(upto))
+    return np.cumsum(upto)[:-1]
 
 
 def _anisotropy(field: Field) -> Iterator[Finding]:
@@ -316,11 +427,14 @@ def _labels(field: Field) -> Iterator[Finding]:
         )
 
 
-def diagnose(field: Field, spec: GridSpec, smoothed: float = 0.0) -> list[Finding]:
-    """All that warns of a field under its range and the grid meant for it, which was blurred by `smoothed` voxels."""
+def diagnose(field: Field, spec: GridSpec, smoothed: float = 0.0, flat: list[Plateau] | None = None) -> list[Finding]:
+    """All that warns of a field under its range and the grid meant for it, which was blurred by `smoothed` voxels.
+
+    `flat` are its `plateaus`, where they are known already.
+    """
     found = [
         *_labels(field),
-        *_plateau(field),
+        *_plateau(field, flat),
         *_noise(field, spec, smoothed),
         *_thin(field, spec),
         *_border(field),

@@ -10,7 +10,7 @@ from illumgrid.errors import BadInput
 from illumgrid.field.bricks import lay_bricks
 from illumgrid.field.layers import ALL, Channel, light_tables
 from illumgrid.field.scene import Scene
-from illumgrid.field.volume import UPWARD, Floats, Side, Volume, index_to_world
+from illumgrid.field.volume import NATIVE, UPWARD, Floats, Side, Volume, index_to_world, slabs
 
 if TYPE_CHECKING:
     import trimesh
@@ -22,7 +22,7 @@ def off_the_data(volume: Volume, isovalue: float, inside: Side) -> float:
     Extraction exactly at data values would create duplicate faces and holes.
     """
     level = np.float32(isovalue)
-    if not (volume.values == level).any():
+    if not any((volume.values[slab] == level).any() for slab in slabs(volume.shape)):
         return float(isovalue)
     return float(np.nextafter(level, np.float32(-np.inf * UPWARD[inside])))
 
@@ -69,32 +69,46 @@ def extract(volume: Volume, isovalue: float, inside: Side, capped: bool) -> tupl
     from skimage.measure import marching_cubes
 
     level = off_the_data(volume, float(volume.to_stored(isovalue)), inside)
-    values = volume.values.copy()  # the extraction needs a writeable buffer
+    low, high = float(volume.values.min()), float(volume.values.max())
+    beyond = None
     if capped:
-        spread = max(float(np.ptp(values)), abs(level), 1e-30)
-        beyond = min(values.min(), level) - spread if inside == "above" else max(values.max(), level) + spread
-        values = np.pad(values, 1, constant_values=np.float32(beyond))
-    if not values.min() < level < values.max():
+        spread = max(float(np.float32(high) - np.float32(low)), abs(level), 1e-30)
+        beyond = float(np.float32(min(low, level) - spread if inside == "above" else max(high, level) + spread))
+        low, high = min(low, beyond), max(high, beyond)
+    if not low < level < high:
         return np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64)
     # scikit-image adds 2e-16 to every difference, which would dominate tiny fields: scale by a power of two.
-    exponent = int(np.frexp(float(values.max()) - float(values.min()))[1])
+    exponent = int(np.frexp(high - low)[1])
     # Its faces wind by the left hand: "ascent" orients them, by the right hand, away from higher values.
     index, faces, _, _ = marching_cubes(
-        np.ldexp(values, -exponent), float(np.ldexp(level, -exponent)),
+        _scaled(volume.values, -exponent, beyond), float(np.ldexp(level, -exponent)),
         gradient_direction="ascent" if inside == "above" else "descent",
     )  # fmt: skip
     index = index.astype(float) - (1.0 if capped else 0.0)
     return np.clip(index, 0.0, np.array(volume.shape) - 1.0), faces.astype(np.int64)
 
 
+def _scaled(values: NDArray[Any], exponent: int, beyond: float | None) -> NDArray[np.float32]:
+    """Values times a power of two, in one new array of single precision; with a border of `beyond` if that is given."""
+    rim = 0 if beyond is None else 1
+    scaled = np.empty(tuple(n + 2 * rim for n in values.shape), np.float32)
+    if beyond is not None:
+        scaled[[0, -1]] = scaled[:, [0, -1]] = scaled[:, :, [0, -1]] = np.ldexp(np.float32(beyond), exponent)
+    within = scaled[tuple(slice(rim, rim + n) for n in values.shape)]
+    for slab in slabs(values.shape):
+        np.ldexp(values[slab].astype(np.float32, copy=False), exponent, out=within[slab])
+    return scaled
+
+
 class Marchable(NamedTuple):
     """All fields of a scene as flat arrays for marching by a compiled kernel, in the frame of the scene.
 
-    The sign of every field is such that its solid is {v >= level}: for `inside` "below", v = -h and levels change sign
-    too. The bricks serve every isovalue.
+    The solid of every field is {sign v >= level}: for `inside` "below" the sign is -1, and levels change theirs too.
+    The bricks serve every isovalue.
     """
 
-    values: NDArray[np.float32]  # all fields concatenated, C order
+    values: NDArray[Any]  # of one of the types `field.volume.NATIVE`: all volumes one after the other, C order
+    sign: Floats  # (F,)
     start: NDArray[np.int64]  # (F,) offset of each field
     shape: NDArray[np.int64]  # (F, 3) voxels
     origin: Floats  # (F, 3) frame position of voxel 0
@@ -130,32 +144,38 @@ class Marchable(NamedTuple):
     asked: Floats  # (2 + D,) cumulative probability of asking lamps, the image, each disc
 
 
-def turned(volume: Volume, inside: Side) -> NDArray[np.float32]:
-    """Values with the solid where they are high; no copy if that is so already."""
-    return volume.values if UPWARD[inside] > 0 else -volume.values
+def _together(volumes: Sequence[Volume]) -> tuple[NDArray[Any], NDArray[np.int64]]:
+    """The values of volumes as one flat array, and where each begins: a single volume is not copied."""
+    parts = list({id(volume.values): volume.values.reshape(-1) for volume in volumes}.items())
+    ends = np.cumsum([0, *(len(values) for _, values in parts)], dtype=np.int64)
+    first = {key: start for (key, _), start in zip(parts, ends)}
+    kind = np.result_type(*(values for _, values in parts))
+    together = parts[0][1].view()
+    if len(parts) > 1:  # of two types that no small one holds, all are promoted
+        together = np.concatenate([v for _, v in parts], dtype=kind if kind in NATIVE else np.float32)
+    together.setflags(write=False)  # like a single volume: otherwise Numba compiles all kernels for a second type
+    return together, np.array([first[id(volume.values)] for volume in volumes])
 
 
 def marchable(scene: Scene, channels: Sequence[Channel] = ALL) -> Marchable:
-    """Lay out a scene for marching. This takes time, so keep the result. A single field is not copied.
+    """Lay out a scene for marching. This takes time, so keep the result. A single volume is not copied.
 
     Albedos and lights have a column for each of `channels`, by default red, green and blue of all light together.
     """
-    parts = [turned(f.volume, f.inside) for f in scene.fields]
-    values = [p.reshape(-1) for p in parts]
-    bricks = [lay_bricks(p) for p in parts]
+    values, start = _together([f.volume for f in scene.fields])
+    bricks = [lay_bricks(f.volume.values, f.upward) for f in scene.fields]
     records = [b.records.reshape(-1) for b in bricks]
     materials = [f.material for f in scene.fields] + [q.material for q in scene.quads]
     colors, tables = [channel.color for channel in channels], light_tables(scene, channels)
-    together = values[0].view() if len(parts) == 1 else np.concatenate(values)
-    together.setflags(write=False)  # like a single volume: otherwise Numba compiles all kernels for a second type
     return Marchable(
-        values=together,
-        start=np.cumsum([0, *(len(v) for v in values)], dtype=np.int64)[:-1],
-        shape=np.array([p.shape for p in parts], dtype=np.int64),
+        values=values,
+        sign=np.array([f.upward for f in scene.fields]),
+        start=start,
+        shape=np.array([f.volume.shape for f in scene.fields], dtype=np.int64),
         origin=scene.to_frame([f.volume.origin for f in scene.fields]),
         spacing=np.array([f.volume.spacing for f in scene.fields]),
         steps=np.array([b.steps for b in bricks]),
-        bricks=records[0] if len(parts) == 1 else np.concatenate(records),
+        bricks=records[0] if len(records) == 1 else np.concatenate(records),
         brick_start=np.cumsum([0, *(len(b.records) for b in bricks)], dtype=np.int64)[:-1],
         brick_shape=np.array([b.shape for b in bricks], dtype=np.int64),
         albedo=np.ascontiguousarray(np.array([material.albedo for material in materials])[:, colors]),

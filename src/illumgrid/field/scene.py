@@ -107,7 +107,8 @@ class Field:
 
     def solid(self, values: ArrayLike, isovalues: ArrayLike) -> NDArray[np.bool_]:
         """Whether points with these values of h lie in the solids of these isovalues; or both as stored values."""
-        return np.asarray(self.upward * np.asarray(values) >= self.upward * np.asarray(isovalues))
+        values, isovalues = np.asarray(values), np.asarray(isovalues)
+        return np.asarray(values >= isovalues if self.upward > 0 else values <= isovalues)
 
     @property
     def sweep(self) -> Floats:

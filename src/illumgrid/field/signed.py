@@ -15,10 +15,10 @@ POSITIVE, NEGATIVE = COLOURS[1], COLOURS[2]
 
 def without_gaps(volume: Volume) -> Volume:
     """Voxels that are not finite become 0, which no surface encloses; with a warning."""
-    good = np.isfinite(volume.values)
-    if good.all():
+    if not volume.gaps:
         return volume
-    tell("finite", f"{int(good.size - good.sum())} of {good.size} voxels are not finite: they became 0", stacklevel=2)
+    good = np.isfinite(volume.values)
+    tell("finite", f"{volume.gaps} of {good.size} voxels are not finite: they became 0", stacklevel=2)
     return volume.with_values(np.where(good, volume.values, np.float32(volume.to_stored(0.0))))
 
 

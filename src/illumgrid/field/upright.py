@@ -5,7 +5,7 @@ import numpy as np
 from illumgrid.errors import BadInput
 from illumgrid.field.boundaries import otsu_threshold
 from illumgrid.field.scene import Scene
-from illumgrid.field.volume import Floats
+from illumgrid.field.volume import Floats, slabs
 
 UPS = {
     f"{sign}{name}": factor * axis for sign, factor in (("", 1.0), ("-", -1.0)) for name, axis in zip("xyz", np.eye(3))
@@ -50,7 +50,8 @@ def up_of(scene: Scene) -> str:
         level = first.volume.to_stored(otsu_threshold(first.volume, first.inside))
     except BadInput:  # constant
         return "z"
-    areas = first.solid(first.volume.values, level).sum(axis=(0, 1))
+    values = first.volume.values
+    areas = sum(np.count_nonzero(first.solid(values[slab], level), axis=(0, 1)) for slab in slabs(values.shape))
     ends = areas[areas > 0][[0, -1]] / areas.max()
     return "-z" if ends[1] > FLAT and ends[0] < ROUND else "z"
 

@@ -5,6 +5,7 @@ Between voxels a volume is trilinear. Every level set in this package is a level
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, Literal, Protocol
 
 import numpy as np
@@ -73,17 +74,32 @@ def placement(origin: ArrayLike, spacing: ArrayLike, direction: ArrayLike) -> tu
     return at, step, axes if np.abs(axes @ axes.T - np.eye(3)).max() < 1e-14 else nearest
 
 
+NATIVE = tuple(map(np.dtype, ("uint8", "int8", "uint16", "int16", "float32")))
+"""Types of values that are kept as they come: each number of theirs is one of single precision."""
+
+AT_ONCE = 1 << 22
+"""Voxels that are looked at together: bounds the memory."""
+
+
+def slabs(shape: tuple[int, ...], most: int = AT_ONCE) -> Iterator[slice]:
+    """Slices of the first axis, each of about `most` voxels, that together are the whole array."""
+    rows = max(1, most // max(1, int(np.prod(shape[1:]))))
+    for first in range(0, shape[0], rows):
+        yield slice(first, min(first + rows, shape[0]))
+
+
 @dataclass(frozen=True, eq=False)
 class Volume:
     """A scalar field h = slope · value + intercept, sampled at voxel centres, compared by identity.
 
-    Values are kept in single precision. Where that would cost h more than `DIGITS` of its span (a large offset), or
-    where h is beyond the numbers of single precision, they are mapped onto about -1 to 1; slope and intercept undo it.
+    Values of 8 or 16 bits and of single precision are kept as they come, without a copy where they lie in C order; all
+    others in single precision. Where that would cost h more than `DIGITS` of its span (a large offset), or where h is
+    beyond the numbers of single precision, they are mapped onto about -1 to 1; slope and intercept undo it.
 
     Parameters
     ----------
     values : (nx, ny, nz) array_like of real numbers
-        At the voxel centres, axes x, y, z; kept as read-only float32. At least two voxels along each axis.
+        At the voxel centres, axes x, y, z; kept read-only as one of `NATIVE`. At least two voxels along each axis.
     origin : (3,) array_like
         World position of voxel (0, 0, 0).
     spacing : (3,) array_like
@@ -101,7 +117,7 @@ class Volume:
         If the values are not real, not 3D, too few, or all not finite; or if the placement is invalid.
     """
 
-    values: NDArray[np.float32]
+    values: NDArray[Any]
     origin: Floats = field(default_factory=lambda: np.zeros(3))
     spacing: Floats = field(default_factory=lambda: np.ones(3))
     direction: Floats = field(default_factory=lambda: np.eye(3))
@@ -119,14 +135,13 @@ class Volume:
         if not (np.isfinite([slope, intercept]).all() and slope):
             raise BadInput(f"slope and intercept are {slope} and {intercept}; expected finite numbers, the first not 0")
         if slope < 0:
-            values, slope = -values.astype(float), -slope
-        values, slope, intercept = _for_single_precision(values, slope, intercept)
-        with np.errstate(over="ignore"):  # a float64 beyond float32 becomes infinite, which is handled
-            single = np.ascontiguousarray(values, dtype=np.float32).view()
-        if not np.isfinite(single).any():
+            values, slope = -values.astype(np.float32 if values.dtype in NATIVE else float), -slope
+        values, slope, intercept = _as_kept(values, slope, intercept)
+        kept = np.ascontiguousarray(values).view()
+        if not any(np.isfinite(kept[slab]).any() for slab in slabs(kept.shape)):
             raise BadInput("the values are all NaN or infinite; expected finite numbers")
-        single.setflags(write=False)
-        object.__setattr__(self, "values", single)
+        kept.setflags(write=False)
+        object.__setattr__(self, "values", kept)
         object.__setattr__(self, "slope", slope)
         object.__setattr__(self, "intercept", intercept)
         for name, value in zip(
@@ -141,13 +156,37 @@ class Volume:
         nx, ny, nz = self.values.shape
         return nx, ny, nz
 
+    @cached_property
+    def gaps(self) -> int:
+        """How many voxels are not finite."""
+        if self.values.dtype.kind != "f":
+            return 0
+        return int(sum(np.count_nonzero(~np.isfinite(self.values[slab])) for slab in slabs(self.shape)))
+
+    @cached_property
+    def stored_extremes(self) -> tuple[np.float64, np.float64]:
+        """Lowest and highest stored value, among the finite ones."""
+        low, high = self.values.min(), self.values.max()
+        if not (np.isfinite(low) and np.isfinite(high)):
+            good = [part[np.isfinite(part)] for part in (self.values[slab] for slab in slabs(self.shape))]
+            low, high = min(part.min() for part in good if part.size), max(part.max() for part in good if part.size)
+        return np.float64(low), np.float64(high)
+
+    @cached_property
+    def tally(self) -> tuple[NDArray[Any], NDArray[np.int64]]:
+        """Stored values of 8 or 16 bits that occur, and how often each does."""
+        width, counts = self.values.itemsize, np.zeros(1 << 8 * self.values.itemsize, np.int64)
+        for slab in slabs(self.shape):
+            counts += np.bincount(self.values[slab].reshape(-1).view(f"u{width}"), minlength=len(counts))
+        numbers = np.arange(len(counts), dtype=f"u{width}").view(self.values.dtype)
+        there = np.flatnonzero(counts)
+        there = there[np.argsort(numbers[there])]
+        return numbers[there], counts[there]
+
     @property
     def extremes(self) -> tuple[float, float]:
         """Lowest and highest h, among the finite ones."""
-        low, high = np.float64(self.values.min()), np.float64(self.values.max())
-        if not (np.isfinite(low) and np.isfinite(high)):
-            good = self.values[np.isfinite(self.values)]
-            low, high = np.float64(good.min()), np.float64(good.max())
+        low, high = self.stored_extremes
         return float(self.in_units(low)), float(self.in_units(high))
 
     def in_units(self, stored: ArrayLike) -> Floats:
@@ -175,10 +214,20 @@ DIGITS = 1e-5
 """Share of the span of a field that rounding to single precision may cost it."""
 
 
+def _as_kept(values: NDArray[Any], slope: float, intercept: float) -> tuple[NDArray[Any], float, float]:
+    """The same field with values of a `NATIVE` type: as they came, wherever one holds them well."""
+    native = values.dtype.newbyteorder("=")
+    if values.dtype == np.bool_:
+        return values.astype(np.uint8), slope, intercept
+    if native in NATIVE or native == np.float16:
+        return values.astype(np.float32 if native == np.float16 else native, copy=False), slope, intercept
+    values, slope, intercept = _for_single_precision(values, slope, intercept)
+    with np.errstate(over="ignore"):  # a float64 beyond float32 becomes infinite, which is handled
+        return values.astype(np.float32, copy=False), slope, intercept
+
+
 def _for_single_precision(values: NDArray[Any], slope: float, intercept: float) -> tuple[NDArray[Any], float, float]:
     """The same field with values that single precision holds well: as they came, wherever it does."""
-    if values.dtype.itemsize < 4 or values.dtype == np.float32:
-        return values, slope, intercept
     wide = values.astype(np.float64) if values.dtype != np.float64 else values
     good = np.isfinite(wide)
     if not good.any():
@@ -196,20 +245,31 @@ def _for_single_precision(values: NDArray[Any], slope: float, intercept: float) 
     return (wide - middle) / scale, slope * scale, intercept + slope * middle
 
 
+def histogram(volume: Volume, bins: int, ends: tuple[float, float] | None = None) -> tuple[NDArray[np.int64], Floats]:
+    """Counts of the stored values in even bins between stored `ends`, by default the extremes, and the bins' edges."""
+    # np.float64, not float: for float32 values NumPy would compute the edges in float32, too coarse far from 0.
+    low, high = (np.float64(x) for x in (volume.stored_extremes if ends is None else ends))
+    if volume.values.dtype.kind == "f":
+        return np.histogram(volume.values, bins, (low, high))  # it leaves out what is not finite
+    values, counts = volume.tally  # many times faster than to look at every voxel
+    _, edges = np.histogram(values[:0], bins, (low, high))
+    found, _ = np.histogram(values, bins, (low, high), weights=counts)
+    return found.astype(np.int64), edges
+
+
 def finite(volume: Volume, inside: Side) -> Volume:
     """Replace non-finite values, with a warning: NaN by the value farthest outside, ±inf by the finite extremes."""
-    good = np.isfinite(volume.values)
-    if good.all():
+    if not volume.gaps:
         return volume
-    low, high = volume.values[good].min(), volume.values[good].max()
+    good = np.isfinite(volume.values)
+    low, high = (float(x) for x in volume.stored_extremes)
     outermost = low if UPWARD[inside] > 0 else high
     lowest, highest = volume.extremes
     farthest = lowest if UPWARD[inside] > 0 else highest
-    bad = int(good.size - good.sum())
     where = np.unravel_index(int(np.argmin(good)), volume.shape)
     tell(
         "finite",
-        f"{bad} of {good.size} voxels are not finite (the first at {tuple(map(int, where))}): NaN became "
+        f"{volume.gaps} of {good.size} voxels are not finite (the first at {tuple(map(int, where))}): NaN became "
         f"{farthest:g}, the value farthest outside, infinities became {lowest:g} and {highest:g}",
         stacklevel=2,
     )
@@ -225,7 +285,7 @@ def smooth(volume: Volume, sigma: float) -> Volume:
         return volume
     from scipy.ndimage import gaussian_filter
 
-    return volume.with_values(gaussian_filter(volume.values, sigma, mode="nearest"))
+    return volume.with_values(gaussian_filter(volume.values, sigma, output=np.float32, mode="nearest"))
 
 
 class Shaped(Protocol):

@@ -23,10 +23,17 @@ def _any_corner(voxels: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return voxels
 
 
-def crossed_cells(field: Field) -> NDArray[np.bool_]:
-    """Voxel cells (nx - 1, ny - 1, nz - 1) through which some level set of the field's range passes."""
-    values, (low, high) = field.volume.values, field.stored_range
+def _crossed_cells(field: Field, rows: slice) -> NDArray[np.bool_]:
+    """Voxel cells (rows, ny - 1, nz - 1) through which some level set of the field's range passes."""
+    values, (low, high) = field.volume.values[rows.start : rows.stop + 1], field.stored_range
     return _any_corner(values >= low) & _any_corner(values <= high)
+
+
+def _overlapped(cells: int, grid_cells: int) -> list[slice]:
+    """The voxel cells along an axis that each grid cell overlaps."""
+    first = np.arange(grid_cells) * cells // grid_cells
+    last = -(-(np.arange(grid_cells) + 1) * cells // grid_cells)
+    return [slice(int(a), int(b)) for a, b in zip(first, last)]
 
 
 def reachable(field: Field, spec: GridSpec) -> NDArray[np.int64]:
@@ -34,14 +41,12 @@ def reachable(field: Field, spec: GridSpec) -> NDArray[np.int64]:
 
     These are the corners of all grid cells that overlap a voxel cell crossed by a level set of the range.
     """
-    crossed = crossed_cells(field)
-    for axis in range(3):
-        line = np.moveaxis(crossed, axis, 0)
-        voxel_cells, grid_cells = len(line), spec.shape[axis] - 1
-        first = np.arange(grid_cells) * voxel_cells // grid_cells
-        last = -(-(np.arange(grid_cells) + 1) * voxel_cells // grid_cells)
-        touched = [line[a:b].any(axis=0) for a, b in zip(first, last)]
-        crossed = np.moveaxis(np.stack(touched), 0, axis)
+    along = [_overlapped(n - 1, m - 1) for n, m in zip(field.volume.shape, spec.shape)]
+    crossed = np.zeros([len(parts) for parts in along], bool)
+    for row, cells in enumerate(along[0]):  # a layer of grid cells at a time: bounds the memory
+        layer = np.asarray(_crossed_cells(field, cells).any(axis=0))
+        layer = np.stack([layer[part].any(axis=0) for part in along[1]])
+        crossed[row] = np.stack([layer[:, part].any(axis=1) for part in along[2]], axis=1)
     nodes = np.zeros(spec.shape, bool)
     for corner in np.ndindex(2, 2, 2):
         nodes[tuple(slice(c, c + n) for c, n in zip(corner, crossed.shape))] |= crossed

@@ -81,7 +81,7 @@ def critical_values(field: Field) -> tuple[Floats, NDArray[np.int64]]:
     passes, changes the Euler characteristic by the alternating sum of the cells that it completes, which is 0 unless
     the voxel is critical. Equal values are ordered by their position in the array, so that a plateau counts once.
     """
-    values = np.pad(field.upward * field.volume.values, 1, constant_values=-np.inf)
+    values = np.pad(np.float32(field.upward) * field.volume.values.astype(np.float32), 1, constant_values=-np.inf)
     low, high = field.stored_range
     within = (field.volume.values >= low) & (field.volume.values <= high)
     own = np.flatnonzero(np.pad(within, 1))

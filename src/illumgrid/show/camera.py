@@ -3,15 +3,15 @@
 import json
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from illumgrid.errors import BadInput
-from illumgrid.field.levelset import turned, turned_levels
 from illumgrid.field.scene import Scene
 from illumgrid.field.upright import axes_of, up_of
-from illumgrid.field.volume import Floats, box_corners, index_to_world
+from illumgrid.field.volume import Floats, box_corners, index_to_world, slabs
 
 HALF_ANGLE = 0.27  # tangent of half the vertical angle of view, 30 degrees in all
 MARGIN = 1.08  # the picture is this much larger than what it holds
@@ -89,26 +89,28 @@ def angles(view: str | tuple[float, float]) -> tuple[float, float]:
     return azimuth, elevation
 
 
-def _column_ends(values: NDArray[np.float32], level: float) -> Floats:
-    """Indices (m, 3) where the columns of `values` along the last axis enter and leave the solid {v >= level}."""
-    solid = values >= level
-    x, y = np.nonzero(solid.any(axis=2))
-    last = values.shape[2] - 1
-    found = []
-    for step, end in ((-1, solid.argmax(axis=2)[x, y]), (1, last - solid[:, :, ::-1].argmax(axis=2)[x, y])):
-        inner, outer = values[x, y, end].astype(float), values[x, y, np.clip(end + step, 0, last)].astype(float)
-        share = np.divide(inner - level, inner - outer, out=np.zeros_like(inner), where=inner > outer)  # none at a cap
-        found.append(np.stack([x, y, end + step * share], axis=1))
+def _column_ends(values: NDArray[Any], level: np.float64, sign: float) -> Floats:
+    """Indices (m, 3) where columns of `values` along the last axis enter and leave the solid {sign v >= sign level}."""
+    last, found = values.shape[2] - 1, []
+    for slab in slabs(values.shape):
+        part = values[slab]
+        solid = part >= level if sign > 0 else part <= level
+        x, y = np.nonzero(solid.any(axis=2))
+        for step, end in ((-1, solid.argmax(axis=2)[x, y]), (1, last - solid[:, :, ::-1].argmax(axis=2)[x, y])):
+            # From the level, counted inward: 0 at a cap, where the volume ends.
+            inner, outer = (sign * part[x, y, k].astype(float) for k in (end, np.clip(end + step, 0, last)))
+            share = np.divide(inner - sign * level, inner - outer, out=np.zeros_like(inner), where=inner > outer)
+            found.append(np.stack([x + slab.start, y, end + step * share], axis=1))
     return np.concatenate(found)
 
 
 def outline_of(scene: Scene, row: Floats) -> Floats:
     """World points (m, 3) whose hull is that of walls, and of the solids under a row of levels (volumes if none)."""
     found = []
-    for field, level in zip(scene.fields, turned_levels(scene, row)):
-        values = turned(field.volume, field.inside)
+    for field, isovalue in zip(scene.fields, row):
+        level = np.float64(field.volume.to_stored(isovalue))
         for axis in range(3):
-            ends = _column_ends(np.moveaxis(values, axis, 2), level)
+            ends = _column_ends(np.moveaxis(field.volume.values, axis, 2), level, field.upward)
             found.append(index_to_world(field.volume, np.insert(ends[:, :2], axis, ends[:, 2], axis=1)))
     if not sum(map(len, found)):
         found = [box_corners(f.volume) for f in scene.fields]

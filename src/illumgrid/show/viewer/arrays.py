@@ -6,8 +6,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from illumgrid.field.coarse import block_means
 from illumgrid.field.layers import Layer
-from illumgrid.field.volume import Volume, index_to_world
+from illumgrid.field.volume import Volume, slabs
 from illumgrid.grid import GridSpec, IlluminationGrid
 from illumgrid.grid.channels import Channels, mixed
 
@@ -48,12 +49,7 @@ def reduced(volume: Volume, most: int) -> Volume:
     factors = _factors(volume.shape, most)
     if (factors == 1).all():
         return volume
-    padded = np.pad(volume.values, [(0, -n % int(f)) for n, f in zip(volume.shape, factors)], mode="edge")
-    split = padded.reshape([int(k) for n, f in zip(padded.shape, factors) for k in (n // f, f)])
-    origin = index_to_world(volume, (factors[None] - 1) / 2)[0]
-    means = split.mean(axis=(1, 3, 5))
-    spacing = volume.spacing * factors
-    return Volume(means, origin, spacing, volume.direction, volume.slope, volume.intercept, volume.unit)
+    return block_means(volume, factors.tolist())
 
 
 def thinned(grid: IlluminationGrid, most: int) -> IlluminationGrid:
@@ -71,22 +67,34 @@ def thinned(grid: IlluminationGrid, most: int) -> IlluminationGrid:
     return grid.onto(spec)
 
 
-def field_steps(values: NDArray[np.float32], limits: tuple[float, float]) -> tuple[NDArray[Any], float, float, bool]:
-    """Values as whole steps of 8 or 16 bits: (steps, base, step, whether any was clamped); value = base + step · steps.
+def field_steps(
+    volume: Volume, limits: tuple[float, float], sign: float = 1.0
+) -> tuple[NDArray[Any], float, float, bool]:
+    """Stored values times `sign` as whole steps of 8 or 16 bits: (steps, base, step, whether any was clamped).
 
-    Whole numbers that fit stay exact. Others get 65535 steps over all values, or, where that would leave too few for
-    the swept `limits`, over those and eight times their span on either side.
+    Such a value is base + step · steps. Whole numbers that fit stay exact. Others get 65535 steps over all values, or,
+    where that would leave too few for the swept `limits` (of stored values times `sign`), over those and eight times
+    their span on either side.
     """
-    low, high = float(values.min()), float(values.max())
-    if high - low <= _STEPS and max(abs(low), abs(high)) < 2**24 and (values == np.round(values)).all():
-        return (values - low).astype(np.uint8 if high - low < 256 else np.uint16), low, 1.0, False
-    clamped = (limits[1] - limits[0]) * _STEPS < _FINE * (high - low)
-    if clamped:
-        span = limits[1] - limits[0]
-        low, high = max(low, limits[0] - 8 * span), min(high, limits[1] + 8 * span)
-    step = (high - low) / _STEPS or 1.0
-    steps = np.clip(np.round((values.astype(float) - low) / step), 0, _STEPS).astype(np.uint16)
+    low, high = sorted(sign * float(x) for x in volume.stored_extremes)
+    values, step, clamped = volume.values, 1.0, False
+    whole = high - low <= _STEPS and max(abs(low), abs(high)) < 2**24 and _whole(values)
+    if not whole:
+        clamped = (limits[1] - limits[0]) * _STEPS < _FINE * (high - low)
+        if clamped:
+            span = limits[1] - limits[0]
+            low, high = max(low, limits[0] - 8 * span), min(high, limits[1] + 8 * span)
+        step = (high - low) / _STEPS or 1.0
+    steps = np.empty(values.shape, np.uint8 if whole and high - low < 256 else np.uint16)
+    for slab in slabs(values.shape):
+        share = (sign * values[slab].astype(float) - low) / step
+        steps[slab] = share if whole else np.clip(np.round(share), 0, _STEPS)
     return steps, low, step, clamped
+
+
+def _whole(values: NDArray[Any]) -> bool:
+    parts = (values[slab] for slab in slabs(values.shape))
+    return values.dtype.kind != "f" or all((part == np.round(part)).all() for part in parts)
 
 
 def _planes(words: NDArray[np.uint16]) -> bytes:

@@ -12,10 +12,9 @@ from numpy.typing import NDArray
 
 from illumgrid.errors import shown_range
 from illumgrid.field.layers import layers_of
-from illumgrid.field.levelset import turned
 from illumgrid.field.scene import Field, Scene
 from illumgrid.field.upright import axes_of, up_of
-from illumgrid.field.volume import Floats, Lattice, box_corners
+from illumgrid.field.volume import Floats, Lattice, box_corners, histogram
 from illumgrid.light import Illumination
 from illumgrid.show import trust
 from illumgrid.show.camera import HALF_ANGLE, fit_camera, outline_of
@@ -68,11 +67,11 @@ class Stage:
 
 def _histogram(field: Field) -> dict[str, Any]:
     """Voxels over the swept range and a third of its span on either side, as far as there are data."""
-    values, (low, high) = field.volume.values, field.stored_range
+    (least, most), (low, high) = field.volume.stored_extremes, field.stored_range
     margin = (high - low) / 3
-    low = min(low, max(float(values.min()), low - margin))
-    high = max(high, min(float(values.max()), high + margin))
-    counts, _ = np.histogram(values, _BINS, (low, high))
+    low = min(low, max(float(least), low - margin))
+    high = max(high, min(float(most), high + margin))
+    counts, _ = histogram(field.volume, _BINS, (low, high))
     return {"counts": counts.tolist(), "limits": field.volume.in_units([float(low), float(high)]).tolist()}
 
 
@@ -88,7 +87,7 @@ def _field(light: Illumination, number: int, stage: Stage, into: Bytes, notes: l
     volume, grid = reduced(field.volume, MOST_VOXELS), thinned(whole, MOST_NODES)
     sign = field.upward
     ends = sorted(sign * field.stored_range)
-    steps, base, step, clamped = field_steps(turned(volume, field.inside), (ends[0], ends[1]))
+    steps, base, step, clamped = field_steps(volume, (ends[0], ends[1]), sign)
     _note_reduced(notes, f"The field of {field.name}", "voxels", field.volume.shape, volume.shape)
     _note_reduced(notes, f"The light of {field.name}", "nodes", whole.spec.shape, grid.spec.shape)
     if clamped:
