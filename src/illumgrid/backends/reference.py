@@ -139,7 +139,7 @@ def rise_from_surface(q: Floats, end: Floats) -> Floats:
 def march(
     scene: Marchable, f: int, level: Floats, u: Floats, d: Floats, on_surface: Bools
 ) -> tuple[Floats, Ints, Ints]:
-    """First meeting of rays u + t d, in index coordinates, with {sign v >= level}: (t, what, axis of a cap), each (n,)."""
+    """Meeting of rays u + t d, in index coordinates, with {sign v >= level}: (t, what, axis of a cap), each (n,)."""
     n, last = len(u), scene.shape[f] - 1
     t_hit, what, face = np.full(n, np.inf), np.full(n, MISS), np.full(n, -1)
     with np.errstate(divide="ignore", invalid="ignore"):
