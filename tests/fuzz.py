@@ -1,5 +1,8 @@
 """Mutated files against every reader: the outcome must be BadInput or a correct result.
 
+Where a checksum covers the data (gzip, zlib, zip, a finished run), every other case changes only what it covers; then
+the result must be that of the whole file, or a refusal.
+
 ``python tests/fuzz.py --seconds 1800`` works for half an hour; `test_fuzz.py` for a moment, over the corpus first. What
 is found is kept in `tests/corpus` and is from then on a test.
 """
@@ -21,7 +24,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import nibabel
 import numpy as np
+import OpenEXR
 import pydicom
 import pydicom.data
 import SimpleITK as sitk  # noqa: N813
@@ -30,8 +35,10 @@ import tifffile
 from dicom_files import HOUNSFIELD, enhanced
 from grid_files import cube_file, dx_file
 from illumgrid.errors import BadInput
+from illumgrid.field.volume import Volume
 from illumgrid.io import store
 from illumgrid.io.readers import read_scene, read_volume
+from illumgrid.io.readers.sky import read_image
 from illumgrid.light import Illumination
 from test_store import example
 from test_store_trust import reseal
@@ -51,6 +58,8 @@ class Target:
     name: str
     make: Callable[[Path], Path]
     read: Callable[[Path], object]
+    sealed: Callable[[bytes], int] | None = None
+    """Where in the file the bytes begin that a checksum covers, up to the end."""
 
 
 def _volume(ending: str) -> Target:
@@ -61,6 +70,9 @@ def _volume(ending: str) -> Target:
             np.save(folder / "a.npy", values())
         elif plain == "npz":
             np.savez_compressed(file, values=values("float32"), spacing=np.ones(3))
+        elif plain == "mgz":
+            nibabel.MGHImage(values("float32"), np.eye(4)).to_filename(file)
+            return file
         elif plain == "dcm":
             write_series(folder / "series", values("int16", (6, 5, 3)))
             return next(iter(sorted((folder / "series").iterdir())))
@@ -70,7 +82,13 @@ def _volume(ending: str) -> Target:
             file.write_bytes(gzip.compress((folder / f"a.{plain}").read_bytes()))
         return file
 
-    return Target(ending, make, lambda file: read_volume(file.parent if file.suffix == ".dcm" else file))
+    behind = {"nrrd": b"\n\n", "npz": b"", "nii.gz": b"", "npy.gz": b"", "mgz": b""}.get(ending)
+    return Target(
+        ending,
+        make,
+        lambda file: read_volume(file.parent if file.suffix == ".dcm" else file),
+        None if behind is None else lambda clean: clean.index(behind) + len(behind),
+    )
 
 
 def _tiff(name: str, **options: Any) -> Target:
@@ -97,6 +115,47 @@ def _header(ending: str) -> Target:
 def _meta_packed(folder: Path) -> Path:
     write(folder / "a.mha", values("int16"), compress=True)
     return folder / "a.mha"
+
+
+def _meta_beside(folder: Path) -> Path:
+    write(folder / "a.mhd", values("float32"), compress=True)
+    return folder / "a.zraw"
+
+
+def _nifti_2(folder: Path) -> Path:
+    nibabel.Nifti2Image(values("int16"), np.diag([2, 2, 3, 1])).to_filename(folder / "a.nii")
+    return folder / "a.nii"
+
+
+def _slices(folder: Path) -> Path:
+    (folder / "slices").mkdir()
+    for k in range(3):
+        tifffile.imwrite(folder / "slices" / f"{k}.tif", values("uint16")[:, :, k].T.copy(), photometric="minisblack")
+    return folder / "slices" / "1.tif"
+
+
+def _deflated(folder: Path) -> Path:
+    """Slices of DICOM whose whole data set is deflated."""
+    write_series(folder / "series", values("int16", (6, 5, 3)))
+    for file in (folder / "series").iterdir():
+        whole = pydicom.dcmread(file)
+        whole.file_meta.TransferSyntaxUID = pydicom.uid.DeflatedExplicitVRLittleEndian
+        whole.save_as(file)
+    return min((folder / "series").iterdir())
+
+
+def _sky(folder: Path, ending: str) -> Path:
+    pixels = np.random.default_rng(0).random((8, 16, 3), np.float32)
+    file = folder / f"sky.{ending}"
+    if ending == "exr":
+        with OpenEXR.File({"compression": OpenEXR.ZIP_COMPRESSION}, {"RGB": pixels}) as out:
+            out.write(str(file))
+    else:
+        mantissa = (pixels * 255).astype(np.uint8)
+        bits = np.concatenate([mantissa, np.full((8, 16, 1), 128, np.uint8)], axis=2)
+        rows = b"".join(b"\2\2\0\x10" + b"".join(b"\x10" + channel.tobytes() for channel in row.T) for row in bits)
+        file.write_bytes(b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 8 +X 16\n" + rows)
+    return file
 
 
 def _packed(name: str) -> Target:
@@ -130,7 +189,9 @@ def _vti(packed: bool) -> Target:
         (folder / "a.vti").write_bytes(head.encode() + body + b"</AppendedData></VTKFile>")
         return folder / "a.vti"
 
-    return Target("vti packed" if packed else "vti", make, read_volume)
+    return Target(
+        "vti packed" if packed else "vti", make, read_volume, (lambda clean: clean.index(b"_") + 1) if packed else None
+    )
 
 
 def _legacy(folder: Path) -> Path:
@@ -159,10 +220,29 @@ emission = [10, 10, 10]
 radiance = [0.1, 0.1, 0.1]
 """
 
+LIGHTS = """
+[[light]]
+name = "key"
+direction = [0, 0, 1]
+angle = 5.0
+irradiance = [1.0, 1.0, 1.0]
+
+[[light]]
+name = "dome"
+image = "sky.exr"
+"""
+
 
 def _scene(folder: Path) -> Path:
     np.save(folder / "a.npy", values())
     (folder / "s.toml").write_text(SCENE)
+    return folder / "s.toml"
+
+
+def _scene_of_lights(folder: Path) -> Path:
+    np.save(folder / "a.npy", values())
+    _sky(folder, "exr")
+    (folder / "s.toml").write_text(SCENE.partition("[background]")[0] + LIGHTS)
     return folder / "s.toml"
 
 
@@ -179,15 +259,23 @@ def _run(part: str, sealed: bool) -> Target:
                 return None
         stored = store.read(file.parent)
         light = Illumination(stored.scene, stored.levels, stored.grids, stored.walls, stored.recipe)
-        return light.grids[0].lookup(np.zeros((1, 3))), light.exposure
+        return light.grids[0].lookup(np.zeros((1, 3))).tobytes(), light.exposure, light.grids[0].values.tobytes()
 
-    return Target(f"{'forged ' if sealed else ''}{part}", make, read)
+    return Target(f"{'forged ' if sealed else ''}{part}", make, read, None if sealed else lambda clean: 0)
 
 
 TARGETS = (
     *map(_volume, ("nrrd", "nii", "nii.gz", "mha", "mrc", "vtk", "gipl", "tif", "dcm", "npy", "npz", "npy.gz")),
+    *map(_volume, ("mgz", "h5")),
     *map(_header, ("mhd", "nhdr", "hdr")),
-    Target("mha packed", _meta_packed, read_volume),
+    Target("mha packed", _meta_packed, read_volume, lambda clean: clean.index(b"LOCAL\n") + 6),
+    Target("zraw", _meta_beside, lambda file: read_volume(file.with_suffix(".mhd")), lambda clean: 0),
+    Target("nifti 2", _nifti_2, read_volume),
+    Target("slices", _slices, lambda file: read_volume(file.parent)),
+    Target("deflated", _deflated, lambda file: read_volume(file.parent)),
+    Target("sky exr", lambda folder: _sky(folder, "exr"), read_image),
+    Target("sky hdr", lambda folder: _sky(folder, "hdr"), read_image),
+    Target("scene of lights", _scene_of_lights, read_scene),
     _tiff("imagej", imagej=True, metadata={"axes": "ZYX", "spacing": 0.5}, resolution=(5, 5)),
     _tiff("ome", metadata={"axes": "ZYX", "PhysicalSizeX": 0.5}, photometric="minisblack"),
     *(_tiff(codec, compression=codec, photometric="minisblack") for codec in ("lzw", "zstd", "jpeg2000", "packbits")),
@@ -237,10 +325,28 @@ def mutate(data: bytes, chance: random.Random) -> bytes:
     return bytes(result)
 
 
-def judge(target: Target, file: Path) -> str:
-    """Empty if the file was read or refused in one sentence, otherwise a description of the outcome."""
+def mutated(target: Target, clean: bytes, case: int) -> tuple[bytes, bool]:
+    """The file of a case, and whether only what a checksum covers was changed."""
+    chance = random.Random(f"{target.name} {case}")
+    if target.sealed is None or case % 2 == 0:
+        return mutate(clean, chance), False
+    at = target.sealed(clean)
+    return clean[:at] + mutate(clean[at:], chance), True
+
+
+def content(result: Any) -> object:
+    """What was read, to be compared."""
+    if isinstance(result, Volume):
+        return result.values.tobytes(order="F"), result.shape, result.intercept, result.slope
+    return result
+
+
+def judge(target: Target, file: Path, right: object = None) -> str:
+    """Empty if the file was read (as `right`) or refused in one sentence, otherwise a description of the outcome."""
     try:
-        target.read(file)
+        found = content(target.read(file))
+        if right is not None and found != right:
+            return "damaged data were read as good"
     except BadInput as error:
         text = str(error)
         if "\n" in text or "Traceback" in text:
@@ -311,11 +417,13 @@ def batch(target: Target, seed: int, cases: int) -> Iterator[tuple[int, str]]:
         with tempfile.TemporaryDirectory() as place:
             file = target.make(Path(place))
             clean = file.read_bytes()
+            right = content(target.read(file)) if target.sealed else None
             for case in range(seed, seed + cases):
                 os.write(tell, f"{case}\n".encode())
-                file.write_bytes(mutate(clean, random.Random(f"{target.name} {case}")))
+                changed, sealed = mutated(target, clean, case)
+                file.write_bytes(changed)
                 signal.setitimer(signal.ITIMER_PROF, SECONDS)
-                if what := judge(target, file):
+                if what := judge(target, file, right if sealed else None):
                     os.write(tell, f"! {what}\n".encode())
                 signal.setitimer(signal.ITIMER_PROF, 0)
 
@@ -338,7 +446,7 @@ def keep(target: Target, case: int) -> Path:
         file = target.make(Path(place))
         CORPUS.mkdir(exist_ok=True)
         kept = CORPUS / f"{target.name.replace(' ', '-')}@{case}"
-        kept.write_bytes(mutate(file.read_bytes(), random.Random(f"{target.name} {case}")))
+        kept.write_bytes(mutated(target, file.read_bytes(), case)[0])
     return kept
 
 
@@ -361,7 +469,9 @@ def main() -> None:
             if time.monotonic() > end:
                 break
         seed += 200
-    print(f"{wrong} wrong of {sum(count.values())}: {count}")  # noqa: T201
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    took = f"{time.monotonic() - end + asked.seconds:.0f} s, {used.ru_utime + used.ru_stime:.0f} s of a processor"
+    print(f"{wrong} wrong of {sum(count.values())} in {took}, from seed {asked.seed}: {count}")  # noqa: T201
     sys.exit(wrong > 0)
 
 

@@ -211,6 +211,21 @@ def test_bench_writes_what_it_says_whole_and_once(call, tmp_path, ticking):
     assert "new folder" in call(*arguments, code=2)
 
 
+def test_bench_reads_as_run_does(refuse, tmp_path):
+    np.save(tmp_path / "two.npy", np.stack([ball(8).values] * 2))
+    refuse("bench", "two.npy", words=["--time N"])
+    for option, words in {
+        "--time 5": "expected one of its time steps: 0, 1",
+        "--channel 9": "expected one of its channels",
+        "--array f": "--array came with a .npy file",
+        "--spacing 0 1 1": "--spacing is 0.0 1.0 1.0",
+        "--crop 0 9 0 8 0 8": "within 0 8 0 8 0 8",
+        "--downsample 5": "--downsample is 5; expected 1 to 4",
+        "--label 7": "--label is 7; expected one of the labels",
+    }.items():
+        refuse("bench", "two.npy", *("--time 0 " * ("--time" not in option) + option).split(), words=[words])
+
+
 def test_bench_refuses_before_anything_runs(refuse, tmp_path):
     refuse("bench", "nowhere.npy", words=["nowhere.npy"])
     refuse("bench", "v.npy", "--budget", 0, words=["budget"])

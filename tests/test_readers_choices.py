@@ -1,12 +1,14 @@
 """What the user says of a volume that its file does not: spacing, which of several, which part."""
 
+import sys
+
 import numpy as np
 import pytest
 
 from illumgrid.errors import BadInput, IllumgridWarning
 from illumgrid.field.volume import index_to_world
 from illumgrid.io.readers import limits, read_scene, read_volume
-from illumgrid.io.readers.stored import Stored, pick, place
+from illumgrid.io.readers.stored import Stored, pick, place, unsheared
 from volume_files import TURN, refused, values, write
 
 
@@ -127,3 +129,17 @@ def test_warnings_name_the_file(tmp_path):
     np.savez(tmp_path / "a.npz", values=values(), direction=[[1, 0.004, 0], [0, 1, 0], [0, 0, 1]])
     with pytest.warns(IllumgridWarning, match=r"^placement: a\.npz: its axes are 0.23° off"):
         read_volume(tmp_path / "a.npz")
+
+
+def test_a_box_around_axes_that_are_nearly_one_is_refused_before_it_is_made():
+    steps = np.eye(3)
+    steps[0, 1] = 1e9  # rows move by a billion voxels from one to the next
+    with pytest.raises(BadInput, match=r"has .* times its voxels; expected at most 64"):
+        unsheared(Stored(values(), np.zeros(3), steps))
+
+
+def test_a_reader_that_is_not_installed_is_named_with_its_extra(tmp_path, monkeypatch):
+    (tmp_path / "a.gipl").write_bytes(bytes(300))
+    monkeypatch.delitem(sys.modules, "illumgrid.io.readers.itk", raising=False)
+    monkeypatch.setitem(sys.modules, "SimpleITK", None)
+    refused(tmp_path / "a.gipl", "SimpleITK", "pip install illumgrid[itk]")

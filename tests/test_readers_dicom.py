@@ -106,6 +106,16 @@ def test_no_preamble(tmp_path):
     check(read(tmp_path / "a"))
 
 
+@pytest.mark.parametrize("implicit", [True, False])
+def test_no_preamble_and_no_ending(tmp_path, implicit):
+    enhanced(tmp_path / "IM0001", [3, 0, 5, 1, 6, 2, 4], [HOUNSFIELD] * 7)
+    whole = pydicom.dcmread(tmp_path / "IM0001")
+    whole.preamble = None
+    del whole.file_meta
+    whole.save_as(tmp_path / "IM0001", implicit_vr=implicit, little_endian=True, enforce_file_format=False)
+    check(read(tmp_path / "IM0001"))
+
+
 @pytest.mark.parametrize("packing", [RLELossless, JPEG2000Lossless])
 def test_packed_slices(tmp_path, packing):
     field = np.tile(HOUNSFIELD, (13, 11, 1))  # JPEG 2000 needs room for its resolutions
@@ -121,7 +131,7 @@ def test_a_packing_that_needs_a_package_names_it(tmp_path, monkeypatch):
     from pydicom.pixels.decoders.base import Decoder
 
     monkeypatch.setattr(Decoder, "is_available", False)
-    refused(tmp_path / "a", "Explicit VR", "pip install pylibjpeg")
+    refused(tmp_path / "a", "Explicit VR", "pip install illumgrid[dicom]")
 
 
 # What does not lie on one even lattice
@@ -209,8 +219,9 @@ def test_two_phases_are_a_choice(tmp_path, mark):
             whole.InstanceNumber += 10 * k
             whole.save_as(file)
     refused(tmp_path / "a", "2 time steps", "--time", *mark)
+    said = () if mark else ("nothing in its headers tells its 2 volumes",)
     for k in (0, 1):
-        check(read(tmp_path / "a", time=k), HOUNSFIELD + 200 * k)
+        check(read(tmp_path / "a", *said, time=k), HOUNSFIELD + 200 * k)
 
 
 def test_fields_of_view_beside_each_other_are_a_choice(tmp_path):

@@ -1,6 +1,7 @@
 """MetaImage and NRRD: what ITK and pynrrd write and read, and headers that would be somebody's tools."""
 
 import os
+import warnings
 import zlib
 
 import nrrd
@@ -110,6 +111,25 @@ def test_data_after_the_end_are_told(tmp_path):
     (tmp_path / "a.mha").write_bytes(meta_head("LOCAL") + values().T.tobytes() + b"more")
     with pytest.warns(IllumgridWarning, match="file: a.mha: 4 bytes follow its data"):
         assert np.array_equal(read_volume(tmp_path / "a.mha").values, values())
+
+
+@pytest.mark.parametrize("encoding", ["text", "hex", "meta"])
+def test_numbers_after_the_end_of_a_text_are_told(tmp_path, encoding):
+    numbers = values().ravel(order="F")
+    text = numbers.tobytes().hex() if encoding == "hex" else " ".join(map(str, numbers))
+    meta = encoding == "meta"
+    file = tmp_path / ("a.mha" if meta else "a.nrrd")
+    head = meta_head("LOCAL", "BinaryData = False\n") if meta else nrrd_head(encoding) + b"\n"
+    for more, count in (("\n", 0), (" 7 8 \n", 4 if encoding == "hex" else 3)):
+        file.write_bytes(head + text.encode() + more.replace("7 8", "0708" if encoding == "hex" else "7 8").encode())
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            assert np.array_equal(read_volume(file).values, values())
+        said = [str(one.message) for one in caught]
+        assert len(said) == bool(count) and all(f"{count} bytes follow its data" in one for one in said)
+    with pytest.warns(IllumgridWarning, match="bytes follow its data"):  # and where they fill more than one piece
+        file.write_bytes(head + text.encode() + b"\n" * (1 << 20) + b"07")
+        read_volume(file)
 
 
 def test_a_meta_image_with_a_checksum_that_is_wrong(tmp_path):

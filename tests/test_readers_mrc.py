@@ -28,6 +28,8 @@ def test_spacing_and_start(tmp_path):
     assert volume.unit == "Å" and not volume.origin.any()
     shifted = read_volume(saved(tmp_path / "a.map", nxstart=-2, nystart=3, nzstart=4))
     assert np.allclose(shifted.origin, np.array([-2, 3, 4]) * volume.spacing)
+    wider = read_volume(tmp_path / "a.map", spacing=(1, 2, 3))  # starts are counted in voxels, whatever their size
+    assert np.allclose(wider.origin, (-2, 6, 12)) and np.allclose(wider.spacing, (1, 2, 3))
     placed = read_volume(saved(tmp_path / "a.ccp4", origin=(1.5, -2, 8)))
     assert np.allclose(placed.origin, (1.5, -2, 8))
     with pytest.warns(IllumgridWarning, match="its origin and its starts differ"):

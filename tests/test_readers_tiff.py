@@ -6,6 +6,7 @@ import tifffile
 
 from illumgrid.errors import IllumgridWarning
 from illumgrid.io.readers import read_volume
+from microscope_files import lsm_file, stk_file
 from volume_files import refused, values
 
 ZYX = values("uint16").T.copy()
@@ -171,3 +172,20 @@ def test_several_series(tmp_path):
             writer.write(array, photometric="minisblack")
     refused(tmp_path / "a.tif", "--array N")
     assert np.array_equal(read_volume(tmp_path / "a.tif", array=1).values, values()[:, :3])
+
+
+def test_stacks_of_zeiss(tmp_path):
+    three = np.stack([values("uint16") + 300 * channel for channel in range(3)])
+    lsm_file(tmp_path / "a.lsm", three[:1], (2e-7, 2.5e-7, 1e-6))  # metres
+    assert np.array_equal(spaced(tmp_path / "a.lsm", (0.2, 0.25, 1), "µm").values, values())
+    lsm_file(tmp_path / "b.lsm", three, (2e-7, 2.5e-7, 1e-6))
+    refused(tmp_path / "b.lsm", "holds 3 channels: 0, 1, 2", "--channel N")
+    assert np.array_equal(read_volume(tmp_path / "b.lsm", channel=2).values, three[2])
+
+
+def test_stacks_of_metamorph(tmp_path):
+    file = stk_file(tmp_path / "a.stk", values(), 0.125, 0.5, "um")
+    assert np.array_equal(spaced(file, (0.125, 0.125, 0.5), "µm").values, values())
+    stk_file(tmp_path / "b.stk", values(), 1, 0.5, "pixel", calibrated=0)  # numbers that its own flag calls void
+    with pytest.warns(IllumgridWarning, match="does not say how far its voxels are from each other"):
+        spaced(tmp_path / "b.stk", (1, 1, 1), None)

@@ -154,7 +154,7 @@ def test_pieces_are_joined(tmp_path):
 def test_without_lz4_the_command_that_installs_it_is_said(tmp_path, monkeypatch):
     vti(tmp_path / "a.vti", packer="lz4")
     monkeypatch.setitem(sys.modules, "lz4.block", None)
-    refused(tmp_path / "a.vti", "pip install lz4")
+    refused(tmp_path / "a.vti", "pip install illumgrid[lz4]")
 
 
 def test_a_flipped_bit_in_packed_data_is_seen(tmp_path):

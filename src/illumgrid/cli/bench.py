@@ -5,6 +5,8 @@ from typing import Annotated
 
 import typer
 
+from illumgrid.cli.reading import Array, Channel, Crop, Downsample, Label, Spacing, Time
+from illumgrid.cli.reading import given as as_given
 from illumgrid.cli.terminal import progress_bars, reported_warnings, result, say
 
 
@@ -21,6 +23,13 @@ def bench(
     output: Annotated[
         Path | None, typer.Option("--output", "-o", metavar="DIR", help="Where the chart goes. [default: INPUT-bench]")
     ] = None,
+    spacing: Spacing = None,
+    channel: Channel = None,
+    time_step: Time = None,
+    array: Array = None,
+    label: Label = None,
+    crop: Crop = None,
+    downsample: Downsample = None,
     smooth: Annotated[
         float | None, typer.Option(min=0.0, metavar="SIGMA", help="Gaussian blur in voxels before anything else.")
     ] = None,
@@ -39,7 +48,10 @@ def bench(
     from illumgrid.io import disk
     from illumgrid.show.difference import studio
 
-    given = scene_input(source, None, limits, None, False, None, {})
+    reading = as_given(
+        spacing=spacing, channel=channel, time=time_step, array=array, label=label, crop=crop, downsample=downsample
+    )
+    given = scene_input(source, None, limits, None, False, None, reading)
     folder = output or Path(f"{given.name}-bench")
     disk.claim_new(folder)
     with reported_warnings():

@@ -25,14 +25,9 @@ from illumgrid.io.readers.stored import (
     Choice,
     Stored,
     Wanted,
+    part,
     place,
     with_spacing,
-)
-from illumgrid.io.readers.stored import (
-    crop as cropped,
-)
-from illumgrid.io.readers.stored import (
-    downsample as coarser,
 )
 
 __all__ = ["named", "read_scene", "read_volume", "volume_name"]
@@ -50,6 +45,9 @@ UNREADABLE = (
     ),
 )
 """What libraries raise on a file that is not what it should be."""
+
+EXTRAS = {"SimpleITK": "itk"}
+"""Optional packages that read whole files, and the extra that brings each."""
 
 
 def volume_name(path: str | os.PathLike[str]) -> str:
@@ -114,18 +112,16 @@ def read_volume(
     if not os.fspath(path):
         raise BadInput(f"the name of the volume is empty; {EXPECTED}")  # and not the folder one is in
     file = Path(os.path.abspath(path))
+    wanted = Wanted(channel, time, array, crop, None if label is not None else downsample)
     with named(file, EXPECTED) as shown:
-        stored = _read(file, Wanted(channel, time, array))
+        stored = _read(file, wanted)
         if spacing is not None:
             stored = with_spacing(stored, spacing)
-        if crop is not None:
-            stored = cropped(stored, crop)
+        stored = part(stored, wanted)
         if label is not None:
             from illumgrid.io.readers.labels import distance_to
 
-            stored = distance_to(stored, label)
-        if downsample is not None:
-            stored = coarser(stored, downsample)
+            stored = part(distance_to(stored, label), Wanted(downsample=downsample))
         volume, notes = place(stored)
     for name, sentence in notes:
         tell(name, f"{shown}: {_printable(sentence)}", stacklevel=2)
@@ -193,8 +189,9 @@ def _module(family: Family) -> Any:
         if problem.name and problem.name.startswith("illumgrid"):
             raise
         package = (problem.name or "").partition(".")[0]
+        extra = f"pip install illumgrid[{EXTRAS[package]}]" if package in EXTRAS else f"install {package}"
         raise BadInput(
-            f"is read by the package {package}, which is not installed; expected it beside illumgrid; install it"
+            f"is read by the package {package}, which is not installed; expected it beside illumgrid: {extra}"
         ) from problem
 
 

@@ -13,6 +13,7 @@ from illumgrid.errors import BadInput
 from illumgrid.io.readers.limits import DEFLATE, check_axes, check_size
 from illumgrid.io.readers.source import Source, finish, opened, read_array, seekable
 from illumgrid.io.readers.stored import Choice, Stored, Wanted, pick
+from illumgrid.io.readers.windows import Span, need, read_part, single
 
 Header = tuple[tuple[int, ...], bool, np.dtype[Any], int]
 """Shape, whether in Fortran order, dtype, and how many bytes come before the data."""
@@ -26,7 +27,8 @@ def read(source: Source, wanted: Wanted) -> Stored:
     if wanted.array is not None:
         raise BadInput("--array came with a .npy file, which holds one array; leave --array out")
     with opened(source) as stream:
-        return Stored(_read_npy(stream, source.most, wanted), np.zeros(3), np.eye(3))
+        values, whole = _read_npy(stream, source.most, wanted)
+    return Stored(values, np.zeros(3), np.eye(3), whole=whole)
 
 
 def _read_npz(pack: zipfile.ZipFile, wanted: Wanted, most: int) -> Stored:
@@ -37,14 +39,14 @@ def _read_npz(pack: zipfile.ZipFile, wanted: Wanted, most: int) -> Stored:
     info = members[name]
     unpacked = info.compress_size * (DEFLATE if info.compress_type == zipfile.ZIP_DEFLATED else 1)
     with pack.open(info) as stream:  # zipfile compares the checksum where the member ends
-        values = _read_npy(stream, min(most, info.file_size, unpacked), wanted)
+        values, whole = _read_npy(stream, min(most, info.file_size, unpacked), wanted)
     spacing = places.get("spacing", np.ones(3))
     if spacing.shape != (3,) or not np.isfinite(spacing).all() or not (spacing > 0).all():
         raise BadInput(f"spacing is {spacing.tolist()}; expected three positive numbers (a flip belongs in direction)")
     direction = places.get("direction", np.eye(3))
     if direction.shape != (3, 3):
         raise BadInput(f"direction is {direction.tolist()}; expected a 3x3 matrix whose columns are orthonormal")
-    return Stored(values, places.get("origin", np.zeros(3)), direction * spacing)
+    return Stored(values, places.get("origin", np.zeros(3)), direction * spacing, whole=whole)
 
 
 def _choose(shapes: dict[str, tuple[int, ...]], array: Choice) -> str:
@@ -74,37 +76,46 @@ def _place(pack: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDArray[np.float64]:
         return read_array(stream, dtype, shape, "F" if fortran else "C").astype(float)
 
 
-def _read_npy(stream: IO[bytes], most: int, wanted: Wanted) -> NDArray[Any]:
-    """Read the one array of a .npy stream that holds at most `most` bytes."""
+def _read_npy(stream: IO[bytes], most: int, wanted: Wanted) -> tuple[NDArray[Any], tuple[int, ...]]:
+    """What is wanted of the one array of a .npy stream that holds at most `most` bytes, and the shape of all of it."""
     shape, fortran, dtype, start = header(stream)
     if dtype.kind not in "biuf":
         raise BadInput(f"the values have dtype {dtype}; expected real numbers; save the magnitude or one component")
     if not 3 <= len(shape) <= 5 or min(shape) < 1:
         check_axes(shape)
     count = int(np.prod([float(n) for n in shape]))
-    check_size(start + count * dtype.itemsize, most, count * dtype.itemsize)
-    values = read_array(stream, dtype, shape, "F" if fortran else "C")
+    axes, spans = _three_axes(shape, wanted)
+    space = tuple(shape[axis] for axis in axes)
+    check_axes(space)
+    kept = wanted.spans(space)
+    for axis, span in zip(axes, kept):
+        spans[axis] = span
+    check_size(start + count * dtype.itemsize, most, need(dtype, shape, spans))
+    values = read_part(stream, dtype, shape, spans, "F" if fortran else "C")
     finish(stream, spare=0)
-    return _three_axes(values, wanted)
+    return values.reshape([span.count for span in kept]), space
 
 
-def _three_axes(values: NDArray[Any], wanted: Wanted) -> NDArray[Any]:
-    """Of more than three axes: `--time N` takes [N, ...], `--channel N` [..., N]; axes of length 1 are dropped."""
-    shape = "x".join(map(str, values.shape))
-    if wanted.time is not None:
-        number = pick(wanted.time, "time", [""] * (len(values) if values.ndim > 3 else 1))
-        values = values[number] if values.ndim > 3 else values
-    if wanted.channel is not None:
-        number = pick(wanted.channel, "channel", [""] * (values.shape[-1] if values.ndim > 3 else 1))
-        values = values[..., number] if values.ndim > 3 else values
-    while values.ndim > 3 and 1 in (values.shape[0], values.shape[-1]):
-        values = values[0] if values.shape[0] == 1 else values[..., 0]
-    if values.ndim > 3:
+def _three_axes(shape: tuple[int, ...], wanted: Wanted) -> tuple[list[int], list[Span]]:
+    """Which axes are x, y and z, and what is taken of the others.
+
+    Of more than three axes `--time N` takes [N, ...], `--channel N` [..., N]; axes of length 1 are dropped.
+    """
+    axes, spans = list(range(len(shape))), [single(0)] * len(shape)
+    for option, end in (("time", 0), ("channel", -1)):
+        given, many = getattr(wanted, option), len(axes) > 3
+        if given is not None:
+            number = pick(given, option, [""] * (shape[axes[end]] if many else 1))
+            if many:
+                spans[axes.pop(end)] = single(number)
+    while len(axes) > 3 and 1 in (shape[axes[0]], shape[axes[-1]]):
+        axes.pop(0 if shape[axes[0]] == 1 else -1)
+    if len(axes) > 3:
         raise BadInput(
-            f"has {values.ndim} axes ({shape}); expected three, x, y and z; choose one time step along the first axis "
-            "with --time N, or one channel along the last with --channel N"
+            f"has {len(shape)} axes ({'x'.join(map(str, shape))}); expected three, x, y and z; choose one time step "
+            "along the first axis with --time N, or one channel along the last with --channel N"
         )
-    return values
+    return axes, spans
 
 
 def header(stream: IO[bytes]) -> Header:

@@ -12,7 +12,7 @@ import numpy as np
 from illumgrid.errors import BadInput
 from illumgrid.io.readers.limits import AS_FLOAT, check_axes, check_memory, check_size
 from illumgrid.io.readers.source import AGAIN, Source, finish, opened, read_text
-from illumgrid.io.readers.stored import Stored, Wanted, pick
+from illumgrid.io.readers.stored import Stored, Wanted, following, pick
 
 BOHR = "bohr"
 
@@ -46,9 +46,11 @@ def read(source: Source, wanted: Wanted) -> Stored:
         total = math.prod(shape) * len(names)
         check_size(total * 2, source.most, 0)  # a number and a space take two bytes at least
         check_memory(total * (8 + AS_FLOAT))
-        values = read_text(stream, total).reshape(*shape, len(names))[..., chosen]
-        finish(stream)
-    return Stored(values, np.array(origin), np.array([row[1:] for row in rows]).T, unit=unit)
+        flat, behind = read_text(stream, total)
+        values = flat.reshape(*shape, len(names))[..., chosen]
+        more = finish(stream, behind=behind)
+    notes = following(more)
+    return Stored(values, np.array(origin), np.array([row[1:] for row in rows]).T, unit=unit, notes=notes)
 
 
 def _line(stream: IO[bytes]) -> str:

@@ -15,7 +15,8 @@ import pydicom
 from illumgrid.errors import BadInput
 from illumgrid.io.readers.dicom_frames import Frame, frames_of, text
 from illumgrid.io.readers.dicom_pixels import dataset, decoded, on_lattice, planes_of, quiet, scaled, understood
-from illumgrid.io.readers.dicom_stack import arranged, phases, placed, stacks
+from illumgrid.io.readers.dicom_stack import REPEAT, arranged, phases, placed, stacks
+from illumgrid.io.readers.families import bare_dicom
 from illumgrid.io.readers.limits import AS_FLOAT, check_axes, check_memory
 from illumgrid.io.readers.source import Source, find_source
 from illumgrid.io.readers.stored import Note, Stored, Wanted, pick
@@ -79,12 +80,8 @@ def _files(folder: Path) -> Iterator[Path]:
 
 
 def _is_dicom(source: Source) -> bool:
-    """By its mark; or, without the preamble of 128 bytes, by a first element of group 2 or 8."""
-    head = source.head
-    if head[128:132] == b"DICM":
-        return True
-    bare = head[:2] in (b"\x02\0", b"\x08\0") and head[3:4] == b"\0" and len(head) > 256
-    return bare and (head[4:6].isalpha() or source.ending in (".dcm", ".ima"))
+    """By its mark; or, without the preamble of 128 bytes, by its first element."""
+    return source.head[128:132] == b"DICM" or bare_dicom(source.head)
 
 
 def _frames(source: Source, names: dict[str, str] | None = None) -> list[Frame]:
@@ -121,7 +118,11 @@ def _chosen(frames: Sequence[Frame], wanted: Wanted, sources: dict[Path, Source]
             f"a film: its {len(group)} frames are moments of one plane; expected slices; there is no volume in it"
         )
     parts = phases(group)
-    stack = arranged(parts[pick(wanted.time, "time", [name for name, _ in parts])][1])
+    number = pick(wanted.time, "time", [name for name, _ in parts])
+    if parts[number][0].startswith(REPEAT):
+        text = f"nothing in its headers tells its {len(parts)} volumes at the same places from each other"
+        notes.append(("dicom", f"{text}; slices were counted by their numbers and the names of their files"))
+    stack = arranged(parts[number][1])
     kind = stack.frames[0].kind
     shape = (kind.columns, kind.rows, stack.count)
     check_axes(shape)

@@ -26,8 +26,6 @@ MOST_PACKED = 1 << 14
 
 DEFLATED = "1.2.840.10008.1.2.1.99"
 
-CODECS = "pylibjpeg pylibjpeg-libjpeg pylibjpeg-openjpeg"
-
 
 @contextmanager
 def quiet() -> Iterator[list[Any]]:
@@ -172,7 +170,7 @@ def _check_packed(data: Any, name: str) -> None:
     if not decoder.is_available:
         raise BadInput(
             f"its pixels are packed as {shown}, which needs packages that are not installed; expected them "
-            f"beside illumgrid: pip install {CODECS}"
+            "beside illumgrid: pip install illumgrid[dicom]"
         )
     if not syntax.is_encapsulated and "PixelData" in data:
         promised, held = get_expected_length(data), len(data.PixelData)

@@ -18,6 +18,9 @@ ON_PLACE = 0.02
 ASIDE = "first pixel in the plane at"
 """What tells fields of view beside each other from each other."""
 
+REPEAT = "repeat"
+"""Names volumes at the same places that no attribute tells from each other."""
+
 LONGEST_GAP = 3
 """Slices; what is missing between two slices is interpolated up to this, and beyond it refused."""
 
@@ -96,7 +99,7 @@ def phases(frames: Sequence[Frame]) -> list[tuple[str, list[Frame]]]:
     for k in sorted(range(len(frames)), key=lambda k: (frames[k].order, frames[k].file.name, frames[k].index)):
         ranked[seen[int(places[k])]].append(frames[k])
         seen[int(places[k])] += 1
-    return [(f"repeat {rank + 1} of each place", part) for rank, part in ranked.items()]
+    return [(f"{REPEAT} {rank + 1} of each place", part) for rank, part in ranked.items()]
 
 
 def _aside(frame: Frame) -> str:

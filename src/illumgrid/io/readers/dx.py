@@ -48,7 +48,7 @@ def read(source: Source, wanted: Wanted) -> Stored:
         check_memory(count * (8 + AS_FLOAT))
         if dtype is None:
             check_size(count * 2, source.most, 0)  # a number and a space take two bytes at least
-            values = read_text(stream, count).reshape(shape)
+            values = read_text(stream, count)[0].reshape(shape)  # objects that follow say how it is connected
         else:
             check_size(count * dtype.itemsize, source.most, 0)
             values = read_array(stream, dtype, shape, "C")

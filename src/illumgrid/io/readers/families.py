@@ -30,7 +30,7 @@ FAMILIES = (
     # DICOM first: its preamble may look like a TIFF.
     Family("DICOM", "dicom", (".dcm", ".ima"), ((128, b"DICM"),), ("channel", "time", "array"), True),
     Family(
-        *("TIFF", "tiff", (".tif", ".tiff", ".lsm", ".btf")),
+        *("TIFF", "tiff", (".tif", ".tiff", ".lsm", ".stk", ".btf")),
         starts=((0, b"II*\0"), (0, b"MM\0*"), (0, b"II+\0"), (0, b"MM\0+")),
         chooses=("channel", "time", "array"),
     ),
@@ -95,6 +95,18 @@ EXPECTED = (
 SUFFIXES = {ending for family in FAMILIES for ending in family.endings}
 
 
+_REPRESENTATIONS = {b"CS", b"UI", b"UL", b"OB", b"DA", b"TM", b"LO", b"SH"}
+"""Kinds of values that the first element of a DICOM file may have."""
+
+
+def bare_dicom(head: bytes) -> bool:
+    """Whether a file begins like DICOM without its preamble of 128 bytes: by an element of group 2 or 8."""
+    if len(head) < 256 or head[:2] not in (b"\x02\0", b"\x08\0") or head[3] != 0:
+        return False
+    # Either the kind of the value comes next, or, for few bytes, its length.
+    return head[4:6] in _REPRESENTATIONS or (head[2] <= 0x18 and 0 < int.from_bytes(head[4:8], "little") <= 128)
+
+
 def family_of(source: Source) -> Family:
     """The family of a file: its first bytes count, then the ending of its name."""
     for family in FAMILIES:
@@ -106,5 +118,7 @@ def family_of(source: Source) -> Family:
     for family in FAMILIES:
         if source.ending in family.endings:
             return family
+    if bare_dicom(source.head):
+        return FAMILIES[0]
     ending = re.sub(r"[^\w.+-]", "?", source.ending) or "none"
     raise BadInput(f"neither its first bytes nor its ending ({ending}) are those of a volume; {EXPECTED}")

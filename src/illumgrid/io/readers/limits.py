@@ -41,7 +41,8 @@ def check_memory(need: int) -> None:
     """Refuse what needs more bytes of memory than are free."""
     if need > (free := free_memory()):
         raise BadInput(
-            f"needs {gigabytes(need)} of memory, {gigabytes(free)} are free; expected less; coarsen or cut it elsewhere"
+            f"needs {gigabytes(need)} of memory, {gigabytes(free)} are free; expected less; read a part with --crop or "
+            "means over voxels with --downsample"
         )
 
 

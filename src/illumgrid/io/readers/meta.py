@@ -10,16 +10,17 @@ References
 import math
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from illumgrid.errors import BadInput
-from illumgrid.io.readers.limits import CHUNK, check_axes, check_size
-from illumgrid.io.readers.source import Packing, Source, beside, finish, inflated, opened, read_array, read_text
-from illumgrid.io.readers.stored import Note, Stored, Wanted, pick
+from illumgrid.io.readers.limits import CHUNK, check_axes, check_memory, check_size
+from illumgrid.io.readers.source import Packing, Source, beside, finish, inflated, opened, read_text, skip
+from illumgrid.io.readers.stored import Note, Stored, Wanted, following, pick
+from illumgrid.io.readers.windows import Span, join, need, read_part, single, take
 
 TYPES = {
     "MET_CHAR": "i1", "MET_UCHAR": "u1", "MET_SHORT": "i2", "MET_USHORT": "u2", "MET_INT": "i4", "MET_UINT": "u4",
@@ -52,9 +53,8 @@ def read(source: Source, wanted: Wanted) -> Stored:
         time = pick(wanted.time, "time", [""] * (sizes[3] if len(sizes) == 4 else 1))
         channel = pick(wanted.channel, "channel", [""] * channels)
         check_axes(sizes[:3])
-        values, more = _data(source, stream, fields, names, np.dtype(order + TYPES[kind]), (channels, *sizes))
-    if more:
-        notes = (*notes, ("file", f"{more} bytes follow its data, of which its header says nothing; they are left out"))
+        spans = [single(channel), *wanted.spans(sizes[:3]), single(time)][: 1 + len(sizes)]
+        values, more = _data(source, stream, fields, names, np.dtype(order + TYPES[kind]), (channels, *sizes), spans)
     intensity = [
         float(fields.get(f"ElementToIntensityFunction{part}", none)) for part, none in (("Slope", 1), ("Offset", 0))
     ]
@@ -63,8 +63,8 @@ def read(source: Source, wanted: Wanted) -> Stored:
             *notes,
             ("file", "its ElementToIntensityFunction is not applied: values are as stored, as ITK has them"),
         )
-    values = values[channel, ..., time] if len(sizes) == 4 else values[channel]
-    return Stored(values, *place, unit="mm", notes=notes)
+    values = values[0, ..., 0] if len(sizes) == 4 else values[0]
+    return Stored(values, *place, unit="mm", notes=(*notes, *following(more)), whole=sizes[:3])
 
 
 def _header(stream: IO[bytes]) -> tuple[Fields, list[str]]:
@@ -137,47 +137,46 @@ def _place(fields: Fields, axes: int) -> tuple[tuple[NDArray[Any], NDArray[Any]]
 
 
 def _data(
-    source: Source, stream: IO[bytes], fields: Fields, names: list[str], dtype: np.dtype[Any], shape: tuple[int, ...]
-) -> tuple[NDArray[Any], int]:
+    source: Source, stream: IO[bytes], fields: Fields, names: list[str], dtype: np.dtype[Any], shape: tuple[int, ...],
+    wanted: Sequence[Span],
+) -> tuple[NDArray[Any], int]:  # fmt: skip
     """The values, in the order of the file (channel, x, y, z ...), and how many bytes follow them."""
     named = fields["ElementDataFile"]
     packing: Packing = "zlib" if _flag(fields, "CompressedData") else "raw"
     text = "BinaryData" in fields and not _flag(fields, "BinaryData") and packing == "raw"
-    skip = _one(fields, "HeaderSize", -1, 1 << 40, 0)
-    size = math.prod(shape) * dtype.itemsize
+    header = _one(fields, "HeaderSize", -1, 1 << 40, 0)
 
-    def part(of: Source, stream: IO[bytes], local: bool, dims: tuple[int, ...]) -> tuple[NDArray[Any], int]:
+    def part(of: Source, stream: IO[bytes], local: bool, spans: Sequence[Span]) -> tuple[NDArray[Any], int]:
+        dims = shape[: len(spans)]
         count, width = math.prod(dims), 1 if text else dtype.itemsize
-        check_size(count * width, of.most_inside(packing), count * dtype.itemsize)
-        if skip and not local:
-            _skip(stream, of.size - count * dtype.itemsize if skip == -1 and not of.packed else skip)
+        check_size(count * width, of.most_inside(packing), count * 16 if text else need(dtype, dims, spans))
+        if header and not local:
+            skip(stream, of.size - count * dtype.itemsize if header == -1 and not of.packed else header)
         if text:
-            return read_text(stream, count).astype(dtype).reshape(dims, order="F"), 0
+            flat, behind = read_text(stream, count)
+            return take(flat.astype(dtype).reshape(dims, order="F"), spans), finish(stream, behind=behind)
         with inflated(stream, packing) as unpacked:
-            return read_array(unpacked, dtype, dims), finish(unpacked)
+            return read_part(unpacked, dtype, dims, spans), finish(unpacked)
 
     if named.upper() == "LOCAL":
-        return part(source, stream, True, shape)
+        return part(source, stream, True, wanted)
     names = names or _pattern(named) or [named]
     if len(names) > 1 and len(names) != shape[-1]:
         raise BadInput(f"its data are in {len(names)} files, but it has {shape[-1]} slices; expected one each; mend it")
     if len(names) == 1:
         file = beside(source, names[0])
         with opened(file) as data:
-            return part(file, data, False, shape)
-    files = [beside(source, name) for name in names]
-    check_size(size if packing == "raw" and not text else 0, sum(file.most for file in files), size)
-    values, more = np.zeros(shape, dtype, order="F"), 0
-    for number, file in enumerate(files):
-        with opened(file) as data:
-            values[..., number], left = part(file, data, False, shape[:-1])
-            more += left
-    return values, more
+            return part(file, data, False, wanted)
+    files, more = [beside(source, name) for name in names], [0]
+    check_memory(need(dtype, shape, wanted))
 
+    def slice_of(number: int) -> NDArray[Any]:
+        with opened(files[number]) as data:
+            values, left = part(files[number], data, False, wanted[:-1])
+        more[0] += left
+        return values
 
-def _skip(stream: IO[bytes], count: int) -> None:
-    while count > 0 and (chunk := stream.read(min(count, CHUNK))):
-        count -= len(chunk)
+    return join(slice_of, wanted[-1]), more[0]
 
 
 def _pattern(named: str) -> list[str]:

@@ -7,8 +7,9 @@ import numpy as np
 from illumgrid.errors import BadInput
 from illumgrid.io.readers.limits import CHUNK, check_axes, check_size
 from illumgrid.io.readers.nifti import in_lps
-from illumgrid.io.readers.source import AGAIN, Source, opened, read_array
+from illumgrid.io.readers.source import AGAIN, Source, opened
 from illumgrid.io.readers.stored import Stored, Wanted, pick
+from illumgrid.io.readers.windows import need, read_part, single
 
 HEADER = 284
 """Bytes before the data."""
@@ -31,11 +32,12 @@ def read(source: Source, wanted: Wanted) -> Stored:
         time = pick(wanted.time, "time", [""] * sizes[3])
         check_axes(sizes[:3])
         size = math.prod(sizes) * dtype.itemsize
-        check_size(HEADER + size, source.most, size)
-        values = read_array(stream, dtype, sizes)[..., time]
+        spans = [*wanted.spans(sizes[:3]), single(time)]
+        check_size(HEADER + size, source.most, need(dtype, sizes, spans))
+        values = read_part(stream, dtype, sizes, spans)[..., 0]
         while stream.read(CHUNK):  # what follows are notes of FreeSurfer; the checksum is at the end
             pass
     if not int(header["goodRASFlag"]):
         header["delta"], header["Mdc"], header["Pxyz_c"] = 1, np.array([[-1, 0, 0], [0, 0, -1], [0, 1, 0]]), 0
     origin, steps = in_lps(header.get_affine())
-    return Stored(values, origin, steps, unit="mm")
+    return Stored(values, origin, steps, unit="mm", whole=tuple(sizes[:3]))

@@ -7,16 +7,18 @@ References
 """
 
 import math
-from typing import IO, Any
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from illumgrid.errors import BadInput
 from illumgrid.field.volume import Floats
-from illumgrid.io.readers.limits import CHUNK, check_axes, check_size
-from illumgrid.io.readers.source import AGAIN, Source, finish, opened, read_array
-from illumgrid.io.readers.stored import Note, Stored, Wanted, pick
+from illumgrid.io.readers.limits import check_axes, check_size
+from illumgrid.io.readers.source import AGAIN, Source, finish, opened, skip
+from illumgrid.io.readers.stored import Note, Stored, Wanted, following, pick
+from illumgrid.io.readers.windows import need, read_part
 
 HEADER = 1024
 
@@ -41,16 +43,25 @@ def read(source: Source, wanted: Wanted) -> Stored:
         order = _order(header)
         start = HEADER + max(0, int(header["nsymbt"]))
         size = math.prod(shape) * dtype.itemsize
-        check_size(start + size, source.most, size)
-        _skip(stream, start - HEADER)
-        values = read_array(stream, dtype, shape)
+        depth = sections // count
+        kept = wanted.spans([(columns, rows, depth)[axis] for axis in order])
+        spans = [kept[order.index(axis)] for axis in range(3)]
+        spans[2] = replace(spans[2], first=spans[2].first + number * depth, last=spans[2].last + number * depth)
+        check_size(start + size, source.most, need(dtype, shape, spans))
+        skip(stream, start - HEADER)
+        values = read_part(stream, dtype, shape, spans)
         more = finish(stream)
-    depth = sections // count
-    part = values[:, :, number * depth : (number + 1) * depth].transpose(order)
-    origin, steps, placed = _place(header, order)
-    if more:
-        notes = (*notes, ("file", f"{more} bytes follow its data, of which its header says nothing; they are left out"))
-    return Stored(part, origin, steps, unit="Å", notes=(*notes, *placed))
+    origin, steps, starts, placed = _place(header, order)
+    whole = tuple((columns, rows, depth)[axis] for axis in order)
+    return Stored(
+        values.transpose(order),
+        origin,
+        steps,
+        unit="Å",
+        notes=(*notes, *following(more), *placed),
+        whole=whole,
+        start=starts,
+    )
 
 
 def _header(block: bytes) -> Any:
@@ -112,8 +123,8 @@ def _axis_notes(header: Any) -> tuple[Note, ...]:
     return ()
 
 
-def _place(header: Any, order: tuple[int, int, int]) -> tuple[Floats, Floats, tuple[Note, ...]]:
-    """Origin and steps: the cell over its sampling; the origin in the header, or else the starts."""
+def _place(header: Any, order: tuple[int, int, int]) -> tuple[Floats, Floats, Floats | None, tuple[Note, ...]]:
+    """Origin, steps and starts: the cell over its sampling; the origin in the header, or else by the starts."""
     notes: tuple[Note, ...] = ()
     cell, angles = (
         np.array([float(header[name][k]) for k in keys])
@@ -136,10 +147,10 @@ def _place(header: Any, order: tuple[int, int, int]) -> tuple[Floats, Floats, tu
     origin = np.array([float(header["origin"][axis]) for axis in "xyz"])
     by_starts = steps @ starts
     if not origin.any():
-        return by_starts, steps, notes
+        return by_starts, steps, starts, notes
     if starts.any() and np.abs(origin - by_starts).max() > 0.5 * spacing.max():
         notes = (*notes, ("placement", "its origin and its starts differ; the origin was taken"))
-    return origin, steps, notes
+    return origin, steps, None, notes
 
 
 def _cell(angles: Floats) -> NDArray[np.float64]:
@@ -148,8 +159,3 @@ def _cell(angles: Floats) -> NDArray[np.float64]:
     sine = math.sqrt(1 - gamma**2)
     y = (alpha - beta * gamma) / sine
     return np.array([[1, gamma, beta], [0, sine, y], [0, 0, math.sqrt(max(0.0, 1 - beta**2 - y**2))]])
-
-
-def _skip(stream: IO[bytes], count: int) -> None:
-    while count > 0 and (chunk := stream.read(min(count, CHUNK))):
-        count -= len(chunk)

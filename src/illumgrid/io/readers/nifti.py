@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from illumgrid.errors import BadInput
-from illumgrid.io.readers.limits import CHUNK, check_axes, check_size
+from illumgrid.io.readers.limits import check_axes, check_size
 from illumgrid.io.readers.reports import captured, plain
-from illumgrid.io.readers.source import Source, find_source, finish, opened, read_array
-from illumgrid.io.readers.stored import Note, Stored, Wanted, pick
+from illumgrid.io.readers.source import Source, find_source, finish, opened, skip
+from illumgrid.io.readers.stored import Note, Stored, Wanted, following, pick
+from illumgrid.io.readers.windows import Span, need, read_part, single
 
 TO_LPS = np.diag([-1.0, -1.0, 1.0])
 """NIfTI's world is RAS."""
@@ -41,7 +42,7 @@ def _read(source: Source, wanted: Wanted) -> Stored:
     head, data = _pair(source)
     with captured("nibabel.global") as reports, opened(head) as stream:
         header = _header(stream)
-        single = data is head
+        alone = data is head
         dtype, shape = header.get_data_dtype(), tuple(int(n) for n in header.get_data_shape())
         if dtype.kind not in "biuf" or dtype.itemsize > 8:
             what = "a complex number" if dtype.kind == "c" else f"of the type {dtype}"
@@ -52,19 +53,20 @@ def _read(source: Source, wanted: Wanted) -> Stored:
         channel = pick(wanted.channel, "channel", [""] * (shape[4] if len(shape) > 4 else 1))
         check_axes(shape[:3])
         place, notes = _place(header)
+        spans = [*wanted.spans(shape[:3]), single(time), single(channel), single(0), single(0)][: len(shape)]
         slope, intercept, more = _scaling(header)
-        if single:
-            values, left = _voxels(stream, head, header, header.sizeof_hdr, dtype, shape)
+        if alone:
+            values, left = _voxels(stream, head, header, header.sizeof_hdr, dtype, shape, spans)
         else:
             with opened(data) as other:
-                values, left = _voxels(other, data, header, 0, dtype, shape)
+                values, left = _voxels(other, data, header, 0, dtype, shape, spans)
     more = (*more, *(("file", f"nibabel reports: {plain(text)}") for text in reports[:3]))
-    if left:
-        more = (*more, ("file", f"{left} bytes follow its data, of which its header says nothing; they are left out"))
     unit = UNITS.get(header.get_xyzt_units()[0]) if hasattr(header, "get_xyzt_units") else None
-    values = values.reshape((*shape[:3], *shape[3:5], *(1,) * (5 - len(shape[:5]))), order="F")[..., time, channel]
+    values = values.reshape(values.shape[:3], order="F")
     spacing = np.array(header.get_zooms()[:3], float)
-    return Stored(values, *place, slope, intercept, spacing, unit or "mm", (*notes, *more))
+    return Stored(
+        values, *place, slope, intercept, spacing, unit or "mm", (*notes, *more, *following(left)), whole=shape[:3]
+    )
 
 
 def _pair(source: Source) -> tuple[Source, Source]:
@@ -145,16 +147,15 @@ def in_lps(affine: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np
 
 
 def _voxels(
-    stream: IO[bytes], data: Source, header: Any, at: int, dtype: np.dtype[Any], shape: tuple[int, ...]
-) -> tuple[NDArray[Any], int]:
+    stream: IO[bytes], data: Source, header: Any, at: int, dtype: np.dtype[Any], shape: tuple[int, ...],
+    spans: list[Span],
+) -> tuple[NDArray[Any], int]:  # fmt: skip
     """The values from vox_offset on, where `at` bytes have been read, and how many bytes follow them."""
     start = max(int(header["vox_offset"]), at)
     size = math.prod(shape) * dtype.itemsize
-    check_size(start + size, data.most, size)
-    skip = start - at
-    while skip > 0 and (chunk := stream.read(min(skip, CHUNK))):
-        skip -= len(chunk)
+    check_size(start + size, data.most, need(dtype, shape, spans))
     try:
-        return read_array(stream, dtype, (math.prod(shape),)), finish(stream)
+        skip(stream, start - at)
+        return read_part(stream, dtype, shape, spans), finish(stream)
     except gzip.BadGzipFile as problem:
         raise BadInput(f"its packed data are damaged ({problem}); expected a whole file; copy it again") from None

@@ -15,9 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from illumgrid.errors import BadInput
-from illumgrid.io.readers.limits import CHUNK, check_axes, check_size
-from illumgrid.io.readers.source import Packing, Source, beside, finish, inflated, opened, read_array, read_text
-from illumgrid.io.readers.stored import Note, Stored, Wanted, pick
+from illumgrid.io.readers.limits import CHUNK, check_axes, check_memory, check_size
+from illumgrid.io.readers.source import Packing, Source, beside, finish, inflated, opened, read_text, skip
+from illumgrid.io.readers.stored import Note, Stored, Wanted, following, pick
+from illumgrid.io.readers.windows import Span, join, need, read_part, single, take
 
 _TYPES = {
     "i1": ("signed char", "int8", "int8_t"),
@@ -71,13 +72,17 @@ def read(source: Source, wanted: Wanted) -> Stored:
         check_axes([sizes[axis] for axis in spatial])
         place, notes = _place(fields, spatial, directions, sizes)
         order = ">" if fields.get("endian", "little").lower() == "big" else "<"
-        values, more = _data(source, stream, fields, names, np.dtype(order + TYPES[kind]), sizes)
-    if more:
-        notes = (*notes, ("file", f"{more} bytes follow its data, of which its header says nothing; they are left out"))
+        kept = wanted.spans([sizes[axis] for axis in spatial])
+        spans = [single(chosen[axis]) if axis in chosen else kept[spatial.index(axis)] for axis in range(axes)]
+        values, more = _data(source, stream, fields, names, np.dtype(order + TYPES[kind]), sizes, spans)
     units = re.findall(r'"([^"]*)"', fields.get("space units", fields.get("units", "")))
     unit = next((LENGTHS.get(unit.lower(), unit) for unit in units if unit), None)
     medical = fields.get("space", "").lower().removesuffix("-time") in TO_LPS
-    return Stored(values[chosen], *place, unit=unit or ("mm" if medical else None), notes=notes)
+    values = values.reshape([span.count for span in kept], order="F")
+    whole = tuple(sizes[axis] for axis in spatial)
+    return Stored(
+        values, *place, unit=unit or ("mm" if medical else None), notes=(*notes, *following(more)), whole=whole
+    )
 
 
 def _header(stream: IO[bytes]) -> tuple[Fields, list[str]]:
@@ -141,8 +146,8 @@ def _directions(fields: Fields, axes: int) -> list[NDArray[np.float64] | None] |
 
 def _choose(
     fields: Fields, sizes: Sequence[int], directions: list[NDArray[np.float64] | None] | None, wanted: Wanted
-) -> tuple[list[int], tuple[Any, ...]]:
-    """Numbers of the three axes of space, and the index that takes the volume that the user wants."""
+) -> tuple[list[int], dict[int, int]]:
+    """Numbers of the three axes of space; and of each other axis the index that the user wants."""
     axes = len(sizes)
     kinds = [word.lower() for word in fields.get("kinds", "").split()]
     kinds = kinds if len(kinds) == axes else ["???"] * axes
@@ -160,7 +165,7 @@ def _choose(
     many = [axis for axis in others if sizes[axis] > 1]
     if len(many) > 2:
         check_axes(sizes)
-    index: list[Any] = [slice(None)] * axes
+    index: dict[int, int] = {}
     asked = {"time": wanted.time, "channel": wanted.channel}
     late = [axis for axis in others if axis > max(spatial) and kinds[axis] not in _CHANNELS]
     options = {axis: "time" if kinds[axis] == "time" or axis in late else "channel" for axis in others}
@@ -172,7 +177,7 @@ def _choose(
     for option, given in asked.items():
         if given is not None and option not in [options[axis] for axis in many]:
             pick(given, option, [""])
-    return spatial, tuple(index)
+    return spatial, index
 
 
 _CHANNELS = {"list", "vector", "point", "covariant-vector", "normal", "scalar", "stub", "rgb-color", "rgba-color",
@@ -234,58 +239,62 @@ def _spacing(
 
 
 def _data(
-    source: Source, stream: IO[bytes], fields: Fields, names: list[str], dtype: np.dtype[Any], sizes: tuple[int, ...]
-) -> tuple[NDArray[Any], int]:
+    source: Source, stream: IO[bytes], fields: Fields, names: list[str], dtype: np.dtype[Any], sizes: tuple[int, ...],
+    wanted: Sequence[Span],
+) -> tuple[NDArray[Any], int]:  # fmt: skip
     """The values with the axes of the file, and how many bytes follow them."""
     encoding = fields.get("encoding", "").lower()
-    lines, skip = (int(fields.get(key, 0)) for key in ("line skip", "byte skip"))
+    lines, left_out = (int(fields.get(key, 0)) for key in ("line skip", "byte skip"))
 
-    def part(of: Source, stream: IO[bytes], dims: tuple[int, ...]) -> tuple[NDArray[Any], int]:
+    def part(of: Source, stream: IO[bytes], spans: Sequence[Span]) -> tuple[NDArray[Any], int]:
+        dims = sizes[: len(spans)]
         count = math.prod(dims)
         for _ in range(min(lines, 1 << 16)):
             stream.readline(CHUNK)
         if encoding in ("ascii", "text", "txt", "hex"):
-            stream.read(max(0, min(skip, CHUNK)))
+            stream.read(max(0, min(left_out, CHUNK)))
         if encoding in ("ascii", "text", "txt"):
             check_size(count, of.most, count * (8 + dtype.itemsize))
-            return read_text(stream, count).astype(dtype).reshape(dims, order="F"), 0
+            flat, behind = read_text(stream, count)
+            return take(flat.astype(dtype).reshape(dims, order="F"), spans), finish(stream, behind=behind)
         if encoding == "hex":
-            check_size(2 * count * dtype.itemsize, of.most, 4 * count * dtype.itemsize)
-            raw = bytes.fromhex(stream.read(4 * count * dtype.itemsize).decode("ascii"))[: count * dtype.itemsize]
-            return np.frombuffer(raw, dtype).reshape(dims, order="F"), 0
+            size = count * dtype.itemsize
+            check_size(2 * size, of.most, 4 * size)
+            raw = bytes.fromhex(stream.read(4 * size).decode("ascii"))
+            values = np.frombuffer(raw[:size], dtype).reshape(dims, order="F")
+            return take(values, spans), finish(stream, behind=raw[size:].hex().encode())
         if encoding not in PACKINGS:
             raise BadInput(
                 f"its encoding is {encoding[:40]!r}; expected raw, gzip, bzip2, text or hex; save it as gzip"
             )
         packing = PACKINGS[encoding]
-        check_size(count * dtype.itemsize, of.most_inside(packing), count * dtype.itemsize)
-        if skip == -1 and packing == "raw" and not of.packed:
+        check_size(count * dtype.itemsize, of.most_inside(packing), need(dtype, dims, spans))
+        if left_out == -1 and packing == "raw" and not of.packed:
             stream.seek(of.size - count * dtype.itemsize)
         with inflated(stream, packing) as unpacked:
-            left = skip
-            while left > 0 and (chunk := unpacked.read(min(left, CHUNK))):
-                left -= len(chunk)
-            return read_array(unpacked, dtype, dims), finish(unpacked)
+            skip(unpacked, left_out)
+            return read_part(unpacked, dtype, dims, spans), finish(unpacked)
 
     named = fields.get("data file")
     if named is None:
-        return part(source, stream, sizes)
+        return part(source, stream, wanted)
     names = names or _pattern(named) or [named]
     if len(names) == 1:
         file = beside(source, names[0])
         with opened(file) as data:
-            return part(file, data, sizes)
+            return part(file, data, wanted)
     if len(names) != sizes[-1]:
         raise BadInput(f"its data are in {len(names)} files, but it has {sizes[-1]} slices; expected one each; mend it")
-    files = [beside(source, name) for name in names]
-    size = math.prod(sizes) * dtype.itemsize
-    check_size(size if encoding == "raw" else 0, sum(file.most for file in files), size)
-    values, more = np.zeros(sizes, dtype, order="F"), 0
-    for number, file in enumerate(files):
-        with opened(file) as data:
-            values[..., number], left = part(file, data, sizes[:-1])
-            more += left
-    return values, more
+    files, more = [beside(source, name) for name in names], [0]
+    check_memory(need(dtype, sizes, wanted))
+
+    def slice_of(number: int) -> NDArray[Any]:
+        with opened(files[number]) as data:
+            values, left = part(files[number], data, wanted[:-1])
+        more[0] += left
+        return values
+
+    return join(slice_of, wanted[-1]), more[0]
 
 
 def _pattern(named: str) -> list[str]:

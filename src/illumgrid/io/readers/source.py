@@ -194,17 +194,29 @@ def read_array(
     return flat.reshape(tuple(shape), order=order)
 
 
-def read_text(stream: IO[bytes], count: int) -> NDArray[np.float64]:
-    """The next `count` numbers written as text, separated by white space or commas."""
+def skip(stream: IO[bytes], count: int) -> None:
+    """Pass over bytes: in a file by seeking, elsewhere by reading, which unpacks and verifies them."""
+    if isinstance(stream, io.BufferedReader) and isinstance(stream.raw, io.FileIO):
+        stream.seek(max(count, 0), os.SEEK_CUR)
+        return
+    while count > 0 and (chunk := stream.read(min(count, CHUNK))):
+        count -= len(chunk)
+
+
+def read_text(stream: IO[bytes], count: int) -> tuple[NDArray[np.float64], bytes]:
+    """The next `count` numbers written as text, separated by white space or commas, and what was read behind them."""
     flat = np.zeros(count)
-    done, rest = 0, b""
+    done, rest, behind = 0, b"", b""
     while done < count:
         chunk = stream.read(CHUNK)
         text = rest + chunk.replace(b",", b" ")
         cut = len(text) if not chunk else max(text.rfind(b" "), text.rfind(b"\n"), text.rfind(b"\t")) + 1
         text, rest = text[:cut], text[cut:]
+        found = text.split(maxsplit=count - done)
+        if len(found) > count - done:
+            behind = found.pop()
         try:
-            words = np.array(text.split()[: count - done], dtype=float)
+            words = np.array(found, dtype=float)
         except ValueError as problem:
             raise BadInput(
                 f"holds what is no number ({str(problem)[-60:]}); expected {count} numbers; mend it"
@@ -213,15 +225,17 @@ def read_text(stream: IO[bytes], count: int) -> NDArray[np.float64]:
         done += len(words)
         if not chunk and done < count:
             raise BadInput(f"ends after {done} of {count} values; {AGAIN}")
-    return flat
+    return flat, behind + rest
 
 
-def finish(stream: IO[bytes], spare: int = CHUNK) -> int:
+def finish(stream: IO[bytes], spare: int = CHUNK, behind: bytes | None = None) -> int:
     """Read what follows the data, so that the checksum at the end is verified; how many bytes that were (padding: 0).
 
-    More than `spare` bytes are refused: the header does not say what they are.
+    More than `spare` bytes are refused: the header does not say what they are. Of text, `behind` was read already.
     """
     more = stream.read(spare + 1)
     if len(more) > spare:
         raise BadInput(f"has more data than its header promises; {AGAIN}")
-    return len(more) if more.strip(b"\0") else 0
+    if behind is None:
+        return len(more) if more.strip(b"\0") else 0
+    return len((behind + more).strip(b"\0 \t\r\n"))

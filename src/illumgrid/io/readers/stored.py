@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from illumgrid.errors import BadInput
 from illumgrid.field.volume import Floats, Volume
 from illumgrid.io.readers.limits import AS_FLOAT, check_axes, check_memory
+from illumgrid.io.readers.windows import Span, take
 
 Choice = int | str | None
 """Number (from 0) or name of a channel, time step or array; None where the user chose none."""
@@ -25,6 +26,24 @@ class Wanted:
     channel: Choice = None
     time: Choice = None
     array: Choice = None
+    crop: Sequence[int] | None = None
+    downsample: int | None = None
+
+    def spans(self, shape: Sequence[int]) -> list[Span]:
+        """What is kept of the axes x, y and z of a volume; refused where that cannot be."""
+        box = [edge for n in shape for edge in (0, n)] if self.crop is None else list(self.crop)
+        first, last = np.array(box[::2]), np.array(box[1::2])
+        if len(box) != 6 or (first < 0).any() or (last > shape).any() or (last - first < 2).any():
+            raise BadInput(
+                f"--crop is {' '.join(map(str, box))}; expected first and last + 1 along x, y and z, at least 2 voxels "
+                f"within {' '.join(f'0 {n}' for n in shape)}"
+            )
+        factor, least = 1 if self.downsample is None else self.downsample, int((last - first).min())
+        if not 1 <= factor <= least // 2:
+            raise BadInput(
+                f"--downsample is {factor}; expected 1 to {least // 2}, which leaves 2 voxels along each axis"
+            )
+        return [Span(int(a), int(b), factor) for a, b in zip(first, last)]
 
 
 @dataclass(frozen=True)
@@ -44,6 +63,17 @@ class Stored:
     unit: str | None = None
     """Of the world coordinates: "mm", "µm", "Å"."""
     notes: tuple[Note, ...] = ()
+    whole: tuple[int, ...] | None = None
+    """(3,) voxels in the file, where `values` are only the part of them that is wanted, and `origin` is that of all."""
+    start: Floats | None = None
+    """(3,) origin in voxels, where the file has it so: with another spacing it is elsewhere."""
+
+
+def following(count: int) -> tuple[Note, ...]:
+    """What to say of bytes behind the data."""
+    if not count:
+        return ()
+    return (("file", f"{count} bytes follow its data, of which its header says nothing; they are left out"),)
 
 
 def pick(chosen: Choice, option: str, names: Sequence[str]) -> int:
@@ -72,37 +102,19 @@ def pick(chosen: Choice, option: str, names: Sequence[str]) -> int:
     raise BadInput(f"--{option} is {str(chosen)[:60]!r}; expected one of its {kinds}: {listed}")
 
 
-def crop(stored: Stored, box: Sequence[int]) -> Stored:
-    """The voxels from box[0] up to (not with) box[1] along x, box[2] to box[3] along y, box[4] to box[5] along z."""
-    shape = stored.values.shape
-    first, last = np.array(box[::2]), np.array(box[1::2])
-    if len(box) != 6 or (first < 0).any() or (last > shape).any() or (last - first < 2).any():
-        raise BadInput(
-            f"--crop is {' '.join(map(str, box))}; expected first and last + 1 along x, y and z, at least 2 voxels "
-            f"within 0 {shape[0]} 0 {shape[1]} 0 {shape[2]}"
-        )
-    values = stored.values[tuple(slice(int(a), int(b)) for a, b in zip(first, last))]
-    return replace(stored, values=values, origin=stored.origin + stored.steps @ first)
-
-
-def downsample(stored: Stored, factor: int) -> Stored:
-    """Means over blocks of factor³ voxels; what does not fill a block at the upper ends is left out."""
-    shape = np.array(stored.values.shape)
-    if not 1 <= factor <= shape.min() // 2:
-        raise BadInput(
-            f"--downsample is {factor}; expected 1 to {shape.min() // 2}, which leaves 2 voxels along each axis"
-        )
-    if factor == 1:
-        return stored
-    blocks = shape // factor
-    total = np.zeros(blocks)
-    for offset in np.ndindex(factor, factor, factor):
-        total += stored.values[tuple(slice(o, o + n * factor, factor) for o, n in zip(offset, blocks))]
-    total /= factor**3
-    values = total if stored.values.dtype == np.float64 else total.astype(np.float32)
-    origin = stored.origin + stored.steps @ np.full(3, (factor - 1) / 2)
-    spacing = None if stored.spacing is None else stored.spacing * factor
-    return replace(stored, values=values, origin=origin, steps=stored.steps * factor, spacing=spacing)
+def part(stored: Stored, wanted: Wanted) -> Stored:
+    """The voxels that are wanted; what does not fill a block of means at the upper ends is left out."""
+    spans = wanted.spans(stored.whole or stored.values.shape)
+    values = take(stored.values, spans) if stored.whole is None else stored.values
+    first, factor = np.array([span.first + (span.block - 1) / 2 for span in spans]), spans[0].block
+    return replace(
+        stored,
+        values=values,
+        origin=stored.origin + stored.steps @ first,
+        steps=stored.steps * factor,
+        spacing=None if stored.spacing is None else stored.spacing * factor,
+        whole=None,
+    )
 
 
 def with_spacing(stored: Stored, spacing: Sequence[float]) -> Stored:
@@ -111,7 +123,9 @@ def with_spacing(stored: Stored, spacing: Sequence[float]) -> Stored:
     if step.shape != (3,) or not np.isfinite(step).all() or not (step > 0).all():
         raise BadInput(f"--spacing is {' '.join(map(str, np.ravel(spacing)))}; expected three positive numbers: X Y Z")
     notes = tuple(note for note in stored.notes if note[0] != "spacing")
-    return replace(stored, steps=stored.steps / np.linalg.norm(stored.steps, axis=0) * step, spacing=step, notes=notes)
+    steps = stored.steps / np.linalg.norm(stored.steps, axis=0) * step
+    origin = stored.origin if stored.start is None else steps @ stored.start
+    return replace(stored, origin=origin, steps=steps, spacing=step, notes=notes)
 
 
 SKEW = 0.005
@@ -162,6 +176,10 @@ _SHEARED = (
 )
 
 
+MOST_EMPTY = 64
+"""Times its voxels that the box around a sheared volume may have."""
+
+
 def unsheared(stored: Stored) -> Stored:
     """Resampled onto a box of right angles around the sheared one: its first axis is kept, its first plane is kept.
 
@@ -176,9 +194,16 @@ def unsheared(stored: Stored) -> Stored:
     step = np.diag(r)
     top = np.array(stored.values.shape) - 1.0
     corners = np.array(list(np.ndindex(2, 2, 2))) * top @ (r / step[:, None]).T
-    low = np.floor(corners.min(axis=0) + 1e-6).astype(int)
-    shape = np.ceil(corners.max(axis=0) - 1e-6).astype(int) - low + 1
-    check_memory(int(np.prod(shape.astype(float))) * (AS_FLOAT + 8) + stored.values.size * 8)
+    first = np.floor(corners.min(axis=0) + 1e-6)
+    last = np.ceil(corners.max(axis=0) - 1e-6)
+    size = float(np.prod(last - first + 1))
+    if not size <= MOST_EMPTY * stored.values.size:
+        raise BadInput(
+            f"its axes are so oblique that a box around it has {size / stored.values.size:.2g} times its voxels; "
+            f"expected at most {MOST_EMPTY}; resample it elsewhere"
+        )
+    low, shape = first.astype(int), (last - first + 1).astype(int)
+    check_memory(int(size) * (AS_FLOAT + 8) + stored.values.size * 8)
     values = np.asarray(stored.values, np.float64 if stored.values.dtype.itemsize > 4 else np.float32)
     out = np.empty(shape, values.dtype)
     back = np.linalg.inv(r / step[:, None])  # from the new index to the old one

@@ -16,6 +16,7 @@ from illumgrid.io.readers.reports import captured, plain
 from illumgrid.io.readers.source import AGAIN, Source, find_source, seekable
 from illumgrid.io.readers.stored import Note, Stored, Wanted, pick
 from illumgrid.io.readers.tiff_spacing import calibrated, channel_names
+from illumgrid.io.readers.windows import Span, join, need, single, take
 
 CODECS = {1, 5, 7, 8, 32773, 32946, 33003, 33005, 34712, 34925, 50000}
 """None, LZW, JPEG, deflate, packbits, deflate by its old number, JPEG 2000 by three numbers, LZMA, zstd."""
@@ -34,11 +35,38 @@ def read(source: Source, wanted: Wanted) -> Stored:
         number = _series(tiff, wanted)
         _refuse_damaged(reports)
         series, names = tiff.series[number], channel_names(tiff, number)
-        check_pages(tiff, series)
-        values, notes = _three_axes(real(series.asarray(maxworkers=1)), series.axes, wanted, names)
+        order, chosen, notes = _three_axes(series.shape, series.axes, wanted, names)
+        whole = tuple(series.shape[axis] for axis in order)
+        check_axes(whole)
+        kept = wanted.spans(whole)
+        spans = [kept[order.index(axis)] if axis in order else single(chosen[axis]) for axis in range(series.ndim)]
+        check_pages(tiff, series, spans)
+        values = _part(series, spans)
         spacing, unit, more = calibrated(tiff, number)
         notes = (*notes, *more, *_serious(reports))
-    return Stored(values, np.zeros(3), np.diag(spacing), unit=unit, notes=notes)
+    rest = tuple(axis for axis in range(values.ndim) if axis not in order)
+    values = values.transpose([*order, *rest]).reshape([span.count for span in kept])
+    return Stored(values, np.zeros(3), np.diag(spacing), unit=unit, notes=notes, whole=whole)
+
+
+def _part(series: Any, spans: Sequence[Span]) -> NDArray[Any]:
+    """What is wanted of a series, page by page, where each page is a plane of it."""
+    plane = series.keyframe.shape
+    outer = series.ndim - len(plane)
+    paged = outer > 0 and series.shape[outer:] == plane and len(series.pages) == math.prod(series.shape[:outer])
+    if not paged or all(span == Span(0, n) for span, n in zip(spans, series.shape)):
+        return take(real(series.asarray(maxworkers=1)), spans)
+
+    def page(number: int) -> NDArray[Any]:
+        return take(real(series.pages[number].asarray(maxworkers=1)), spans[outer:])
+
+    def planes(axis: int, number: int) -> NDArray[Any]:
+        """The part of all pages whose indices along the axes before `axis` are those of `number`."""
+        if axis == outer:
+            return page(number)
+        return np.moveaxis(join(lambda k: planes(axis + 1, number * series.shape[axis] + k), spans[axis]), -1, 0)
+
+    return planes(0, 0)
 
 
 def read_folder(files: Sequence[Path], wanted: Wanted) -> Stored:
@@ -157,7 +185,7 @@ def _series(tiff: Any, wanted: Wanted) -> int:
     return full[pick(wanted.array, "array", names)]
 
 
-def check_pages(tiff: Any, series: Any) -> None:
+def check_pages(tiff: Any, series: Any, spans: Sequence[Span] | None = None) -> None:
     """Refuse codecs that no volume needs, and pages of which a part is not there or leaves the file."""
     pages = list(series.pages)
     if any(page is None for page in pages):
@@ -188,7 +216,9 @@ def check_pages(tiff: Any, series: Any) -> None:
     if series.dataoffset is not None and len(pages) == 1:
         held = size - series.dataoffset  # one directory for all slices
     most = held * BOUNDED.get(int(first.compression), 1 << 40)
-    check_size(series.nbytes, most, series.nbytes)
+    paged = spans is not None and len(pages) > 1
+    memory = need(series.dtype, series.shape, spans) + 2 * first.nbytes if spans and paged else series.nbytes
+    check_size(series.nbytes, most, memory)
 
 
 def real(values: NDArray[Any]) -> NDArray[Any]:
@@ -199,9 +229,9 @@ def real(values: NDArray[Any]) -> NDArray[Any]:
 
 
 def _three_axes(
-    values: NDArray[Any], axes: str, wanted: Wanted, names: Sequence[str]
-) -> tuple[NDArray[Any], tuple[Note, ...]]:
-    """The volume (x, y, z) of an array with these axes, by tifffile's letters, and what was assumed."""
+    shape: Sequence[int], axes: str, wanted: Wanted, names: Sequence[str]
+) -> tuple[list[int], dict[int, int], tuple[Note, ...]]:
+    """Which of the axes, by tifffile's letters, are x, y and z; the index along each other one; what was assumed."""
     notes: tuple[Note, ...] = ()
     if "Z" not in axes:
         # Pages without a meaning, or else what their writer called time steps, are slices.
@@ -212,19 +242,20 @@ def _three_axes(
             axes = axes.replace(stack, "Z", 1)
     if "S" in axes and "C" not in axes:
         axes = axes.replace("S", "C")
-        names = ("red", "green", "blue", "alpha")[: values.shape[axes.index("C")]]
+        names = ("red", "green", "blue", "alpha")[: shape[axes.index("C")]]
+    chosen = {axis: 0 for axis, letter in enumerate(axes) if letter not in "XYZ" and shape[axis] == 1}
     for option, letter in (("time", "T"), ("channel", "C")):
         given = getattr(wanted, option)
-        count = values.shape[axes.index(letter)] if letter in axes else 1
+        count = shape[axes.index(letter)] if letter in axes else 1
         known = list(names) if letter == "C" and len(names) == count else [""] * count
         number = pick(given, option, known)
         if letter in axes:
-            values, axes = np.take(values, number, axes.index(letter)), axes.replace(letter, "", 1)
-    for axis in [a for a in axes if a not in "XYZ" and values.shape[axes.index(a)] == 1]:
-        values, axes = np.take(values, 0, axes.index(axis)), axes.replace(axis, "", 1)
-    if sorted(axes) != ["X", "Y", "Z"]:
-        check_axes(values.shape[::-1])
+            chosen[axes.index(letter)] = number
+    left = [axis for axis in range(len(axes)) if axis not in chosen]
+    if sorted(axes[axis] for axis in left) != ["X", "Y", "Z"]:
+        check_axes([shape[axis] for axis in left[::-1]])
+        said = "".join(axes[axis] for axis in left)
         raise BadInput(
-            f"its axes are {axes}; expected slices along z, and perhaps channels and time steps; save only those"
+            f"its axes are {said}; expected slices along z, and perhaps channels and time steps; save only those"
         )
-    return values.transpose([axes.index(axis) for axis in "XYZ"]), notes
+    return [axes.index(letter) for letter in "XYZ"], chosen, notes

@@ -34,7 +34,7 @@ def calibrated(tiff: Any, series: int) -> Found:
         return _by_ome(pixels)
     if tiff.is_lsm and (about := tiff.lsm_metadata):
         return _checked([1e6 * float(about.get(f"VoxelSize{axis}", 0)) for axis in "XYZ"], "µm")
-    if tiff.is_stk and (about := tiff.stk_metadata) and about.get("XCalibration"):
+    if tiff.is_stk and (about := tiff.stk_metadata) and about.get("SpatialCalibration") and about.get("XCalibration"):
         depth = float(np.mean(about.get("ZDistance", 0)))
         unit = _unit(about.get("CalibrationUnits"))
         return _checked([float(about["XCalibration"]), float(about["YCalibration"]), depth], unit)

@@ -317,8 +317,8 @@ def _block(packed: bytes, length: int, compressor: str) -> bytes:
             import lz4.block
         except ImportError:
             raise BadInput(
-                "is packed by LZ4, which needs the package lz4; expected it beside illumgrid: pip install lz4; or save "
-                "the volume with another compressor"
+                "is packed by LZ4, which needs the package lz4; expected it beside illumgrid: pip install "
+                "illumgrid[lz4]; or save the volume with another compressor"
             ) from None
         return bytes(lz4.block.decompress(packed, uncompressed_size=length))
     raise BadInput(f"is packed by {compressor[:40]!r}; expected zlib, LZMA or LZ4; save it with one of them")
