@@ -5,10 +5,20 @@ import warnings
 import numpy as np
 import pytest
 
-from illumgrid.field.volume import Volume, interpolate, project
+from illumgrid.field import newton
+from illumgrid.field.volume import (
+    Volume,
+    cell_gradient,
+    interpolate,
+    outward_normals,
+    project,
+    smooth_gradient,
+    unit,
+)
 from shapes import ball
 from test_volume import UNEVEN, noise, within
 
+pytestmark = pytest.mark.plain
 REACH = 1.0  # cells: how far a point may be moved along an axis
 
 
@@ -69,3 +79,17 @@ def test_projection_leaves_the_edge_of_a_plateau():
 def test_nothing_to_project_is_no_trouble():
     at, arrived = project(noise(), np.zeros((0, 3)), np.zeros(0))
     assert at.shape == (0, 3) and arrived.shape == (0,)
+
+
+@pytest.mark.parametrize("side", ["above", "below"])
+def test_compiled_values_and_normals_are_those_of_numpy_bit_for_bit(side):
+    volume = Volume(np.random.default_rng(7).integers(0, 4, (7, 5, 6)), spacing=UNEVEN)  # some differences cancel
+    index = np.concatenate([within(volume, 300), np.argwhere(np.ones(volume.shape)).astype(float)])
+    slopes = smooth_gradient(volume, index)
+    flat = ~slopes.any(axis=1)
+    assert flat.any()
+    slopes[flat] = cell_gradient(volume, index[flat])
+    expected = unit(slopes if side == "below" else -slopes)
+    np.testing.assert_array_equal(outward_normals(volume, index, side), expected)
+    values = [newton.value_at(volume.values, *point) for point in index]
+    np.testing.assert_array_equal(values, interpolate(volume, index))

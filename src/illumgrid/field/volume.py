@@ -373,16 +373,11 @@ def outward_normals(volume: Volume, index: Floats, inside: Side) -> Floats:
 
     Where the central differences cancel, the normal of the trilinear cell is used.
     """
-    gradient = smooth_gradient(volume, index)
-    flat = ~gradient.any(axis=1)
-    if flat.any():
-        gradient[flat] = cell_gradient(volume, index[flat])
-    return unit(-UPWARD[inside] * gradient)
+    from illumgrid.field import newton
 
-
-_MET = 1e-10
-"""Newton steps below this length, in index coordinates, end a projection; the last step is still taken, and convergence
-is quadratic."""
+    result = np.empty((len(index), 3))
+    newton.normals(*_compilable(volume), -UPWARD[inside], np.ascontiguousarray(index, float), result)
+    return result
 
 
 def project(volume: Volume, index: Floats, isovalues: Floats) -> tuple[Floats, NDArray[np.bool_]]:
@@ -395,43 +390,16 @@ def project(volume: Volume, index: Floats, isovalues: Floats) -> tuple[Floats, N
     arrived : (n,) bool
         False where the steps did not converge within one cell of the start, or left the volume.
     """
-    at = index.copy()
-    top = np.array(volume.shape) - 1.0
-    arrived = np.asarray(((index >= -ON_A_VOXEL) & (index <= top + ON_A_VOXEL)).all(axis=1))
-    last = np.full(len(at), np.inf)
-    levels = volume.to_stored(isovalues)
-    moving = np.flatnonzero(arrived)
-    for _ in range(24):
-        here = at[moving]
-        miss = levels[moving] - _interpolate_stored(volume, here)
-        slope = cell_gradient(volume, here)
-        for axis in range(3):  # this component jumps across a plane of voxels: take the mean of both cells
-            on = (here[:, axis] == np.floor(here[:, axis])) & (here[:, axis] > 0) & (here[:, axis] < top[axis])
-            if on.any():
-                before = here[on]
-                before[:, axis] = np.nextafter(before[:, axis], 0.0)
-                slope[on, axis] = 0.5 * (slope[on, axis] + cell_gradient(volume, before)[:, axis])
-        flat = ~slope.any(axis=1)
-        if flat.any():  # at the edge of a plateau only the central differences point outwards
-            slope[flat] = smooth_gradient(volume, here[flat])
-        slope *= volume.spacing  # per index step
-        largest = np.abs(slope).max(axis=1, initial=0.0)
-        step = (
-            slope / np.where(largest > 0, largest, 1.0)[:, None]
-        )  # scaled: the square of a tiny slope would underflow
-        step *= np.divide(miss / np.where(largest > 0, largest, 1.0), (step * step).sum(axis=1), where=largest > 0,
-                          out=np.zeros_like(miss))[:, None]  # fmt: skip
-        length = np.abs(step).max(axis=1, initial=0.0)
-        # On the level set, only rounding remains of the step; without a slope, the set cannot be reached.
-        there = (length < _MET) & (largest > 0) | (miss == 0)
-        arrived[moving[(largest == 0) & (miss != 0)]] = False
-        # Across a kink between two cells full steps can oscillate: halve those that did not shrink.
-        step *= np.where(length >= last[moving], 0.5, 1.0)[:, None]
-        step *= np.minimum(1.0, 0.5 / np.maximum(length, 1e-300))[:, None]
-        last[moving] = np.minimum(last[moving], length)
-        at[moving] = np.where((miss == 0)[:, None], here, np.clip(here + step, 0.0, top))
-        moving = moving[~there & arrived[moving]]
-        if not len(moving):
-            break
-    arrived[moving] = False
-    return at, arrived & (np.abs(at - index).max(axis=1, initial=0.0) <= 1.0)
+    from illumgrid.field import newton
+
+    at, arrived = np.empty_like(index), np.zeros(len(index), bool)
+    levels = np.ascontiguousarray(volume.to_stored(isovalues))
+    newton.project(*_compilable(volume), levels, np.ascontiguousarray(index), at, arrived)
+    return at, arrived
+
+
+def _compilable(volume: Volume) -> tuple[NDArray[Any], tuple[float, ...]]:
+    """Values and spacing for a kernel, always of the same two types: otherwise Numba compiles again."""
+    values = volume.values.view()
+    values.flags.writeable = False
+    return values, tuple(volume.spacing.tolist())
