@@ -8,7 +8,6 @@ from PIL import Image
 
 import illumgrid as ig
 from illumgrid.cli.info import BLOCKS, histogram_line
-from illumgrid.field.volume import histogram
 from shapes import MIRRORED, ball, sampled
 
 QUICK = ("--grid", "8", "--paths", "2", "--bounces", "1")
@@ -32,7 +31,7 @@ def test_a_run_leaves_light_a_record_and_a_picture(call, tmp_path):
     for words in ("10 x 10 x 10 voxels", "0.3 to 0.9", "wrote deep/out", "queries x 2 paths"):
         assert words in said
     out = tmp_path / "deep" / "out"
-    assert sorted(p.name for p in out.iterdir()) == ["illumination.exr", "preview.png", "run.json"]
+    assert sorted(p.name for p in out.iterdir()) == ["illumination.exr", "moments.npz", "preview.png", "run.json"]
     assert shown(out / "preview.png").shape == (48, 64, 3)
     made = recipe(out)
     assert made["input"] == "v.npy" and made["smooth"] == 0 and made["warnings"] == [] and made["exposure"] > 0
@@ -43,7 +42,7 @@ def test_a_run_leaves_light_a_record_and_a_picture(call, tmp_path):
 
 def test_without_options_the_folder_is_named_after_the_input_and_the_range_comes_from_the_data(call, tmp_path):
     call("run", "v.npy", *QUICK, "--no-preview")
-    assert sorted(p.name for p in (tmp_path / "v-light").iterdir()) == ["illumination.exr", "run.json"]
+    assert sorted(p.name for p in (tmp_path / "v-light").iterdir()) == ["illumination.exr", "moments.npz", "run.json"]
     field = ig.load(tmp_path / "v-light").scene.fields[0]
     assert field.name == "v" and field.inside == "above" and field.material.albedo.tolist() == [0.65] * 3
     assert tuple(field.range) == ig.suggest_range(field.volume)[:2]
@@ -220,7 +219,7 @@ def test_info_tells_of_a_volume_what_is_worth_knowing(call, tmp_path):
 def test_the_histogram_has_blocks_where_there_are_values():
     values = np.zeros((4, 4, 4))
     values.flat[:3] = 1, 1, 0.5
-    line = histogram_line(histogram(ig.Volume(values), 4)[0].tolist())
+    line = histogram_line(ig.Volume(values), 4)
     assert line[0] == "█" and line[1] == " " and line[2] in "▁▂▃" and line[3] in "▂▃▄▅"
 
 

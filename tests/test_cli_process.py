@@ -135,12 +135,12 @@ def test_a_mistake_of_ours_is_not_dressed_up_as_bad_input():
 
 
 def test_redirected_output_reports_progress_at_intervals(capsys, monkeypatch):
-    clock = iter([0.0, 1.0, terminal.INTERVAL + 1, terminal.INTERVAL + 1, terminal.INTERVAL + 2])
+    clock = iter([0.0, 1.0, terminal.INTERVAL + 1, terminal.INTERVAL + 2])
     monkeypatch.setattr(terminal.time, "monotonic", lambda: next(clock))
-    with terminal.progress_bars() as progress:
+    with terminal.progress_bars(lambda: "kept here") as progress:
         for done in (1, 2, 3):
             progress("bake", done, 4)
-    assert capsys.readouterr().err.splitlines() == ["bake: 50%"]
+    assert capsys.readouterr().err.splitlines() == ["bake: 50%, about 20 s left, kept here"]
 
 
 def test_what_a_run_says_of_itself_does_not_command_the_terminal(call, tmp_path):

@@ -21,7 +21,7 @@ from illumgrid.stages import Interpolator, Sampler
 from illumgrid.transport.samples import Queries, Samples, combine, join_queries, join_samples
 from illumgrid.transport.stages import fill_nodes
 from illumgrid.transport.tracer import Tracer, answered
-from illumgrid.transport.walk import Keeper, Rank, Walk, answer, split
+from illumgrid.transport.walk import Keeper, Ranks, Walk, answer, in_order, split
 
 Progress = Callable[[str, int, int], None]
 """Called with what is being done, how much of it is done, and how much there is."""
@@ -88,7 +88,7 @@ class Bake:
         map: Map = map,
         progress: Progress = lambda what, done, total: None,
         keep: Keeper | None = None,
-        rank: Rank | None = None,
+        ranks: Ranks | None = None,
     ) -> "Bake":
         """Walk the paths with these numbers from every target as well; see `bake` for the others."""
         ranges = [range(n * paths.start, n * paths.stop) for n in self.weights]
@@ -106,7 +106,7 @@ class Bake:
         progress(what, done, total)
         before = answered.set(tick)
         try:
-            for found in map(partial(answer, tracer, self.bounces, self.seed), going.pieces(rank)):
+            for found in map(partial(answer, tracer, self.bounces, self.seed), going.pieces(ranks)):
                 number, rows = going.take(found)
                 if keep:
                     keep.keep(first[number] + rows, found)
@@ -220,6 +220,21 @@ def wall_queries(scene: Scene, levels: Levels) -> list[Queries]:
     return batches
 
 
+def coarse_first(scene: Scene, specs: Sequence[GridSpec], levels: Levels, queries: Queries) -> NDArray[np.int8]:
+    """Ranks (n,) of targets: 0 for every fourth node or texel along each axis, 1 for every second, 2 for the others."""
+    index = np.zeros((len(queries), 3), np.int64)
+    for target in np.unique(queries.target):
+        own = queries.target == target
+        if target < len(specs):
+            index[own] = np.round(world_to_index(specs[target], queries.point[own]))
+        else:
+            nu, nv = scene.quads[target - len(specs)].texels
+            number = (queries.id[own] & np.uint64((1 << 40) - 1)).astype(np.int64)
+            index[own] = np.stack(np.unravel_index(number, (len(levels.table), nv, nu)), axis=1)
+    even, fourth = ((index % step == 0).all(axis=1).astype(np.int8) for step in (2, 4))
+    return np.asarray(2 - even - fourth, np.int8)
+
+
 def texel_paths(nodes: int, texels: int) -> int:
     """Paths from a texel for each from a node: up to eight, while the walls are no more work than the grids.
 
@@ -319,6 +334,7 @@ def bake(
     seed: int = 0,
     map: Map = map,
     progress: Progress = lambda what, done, total: None,
+    keep: Keeper | None = None,
 ) -> Baked:
     """Compute the illumination grids of a scene, and the light of its walls.
 
@@ -342,6 +358,8 @@ def bake(
         What spreads the batches: the built-in ``map``, or that of an executor or cluster.
     progress : callable, optional
         Called with (what, done, total).
+    keep : Keeper, optional
+        Keeps the light as it is computed, from coarse to fine, and knows that of a run that was stopped.
     """
     clock = [time.perf_counter()]
     nodes = [batch for batch in sampler.queries(scene, specs, seed) if len(batch)]
@@ -351,8 +369,13 @@ def bake(
     state = Bake((*nodes, *texels), (1,) * len(nodes) + (more,) * len(texels), bounces, seed)
     del nodes, texels
     clock.append(time.perf_counter())
+    ranks = None if keep is None else [coarse_first(scene, specs, levels, batch) for batch in state.targets]
+    if keep is not None and ranks:
+        keep.begin(state.targets, in_order(ranks))
     for numbers in paths:
-        state = state.walk(tracer, numbers, map, progress)
+        state = state.walk(tracer, numbers, map, progress, keep, ranks)
+    if keep is not None and state.answers:
+        keep.end(state.samples)
     clock.append(time.perf_counter())
 
     grids, answers, walked = [], list(state.answers), state.paths

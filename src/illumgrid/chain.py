@@ -21,6 +21,7 @@ from illumgrid.field.lattice import specs_over
 from illumgrid.field.layers import layers_of
 from illumgrid.field.scene import Scene, level_table
 from illumgrid.io import needs, store
+from illumgrid.io.partial import Partial
 from illumgrid.light import Illumination
 from illumgrid.stages import Backend, Interpolator, Sampler
 from illumgrid.transport.stages import capabilities
@@ -59,6 +60,7 @@ def run(
     judge: bool = True,
     map: Map = map,
     progress: Progress = lambda what, done, total: None,
+    keep: Partial | None = None,
 ) -> Illumination:
     """Light a scene: one illumination grid for each field.
 
@@ -90,6 +92,8 @@ def run(
         What spreads the work: see `illumgrid.bake.bake`.
     progress : callable, optional
         Called with (what, done, total).
+    keep : Partial, optional
+        Keeps the light that is finished; what the run that it goes on with had chosen is taken over.
 
     Returns
     -------
@@ -116,10 +120,16 @@ def run(
     if isovalues is not None and isinstance(sampler, str) and "count" in registry.option_names("sampler", sampler):
         options["count"] = isovalues
     chosen = _stage("sampler", sampler, options), _stage("backend", backend), _stage("interpolator", interpolator)
-    begun, plan, tracer = time.perf_counter(), None, prepare(chosen[1], scene)
+    plan: Any = None
+    begun, tracer = time.perf_counter(), prepare(chosen[1], scene)
     walked: Iterable[range] = [range(PATHS if paths is None else paths)]
+    left_out, before = 0.0, None if keep is None else keep.chosen
     if error is not None or seconds is not None:
         _check_plannable(error, seconds, *chosen)
+    if before:
+        grid, bounces, left_out, plan = (before[key] for key in ("grid", "bounces", "left_out", "plan"))
+        walked = _gone_on_with(before, None if error or seconds else paths or PATHS)
+    elif error is not None or seconds is not None:
         progress("pilot", 0, 1)
         plan = planned(
             scene, tracer, levels, error=error, seconds=seconds, grid=grid, paths=paths, bounces=bounces, seed=seed
@@ -135,11 +145,15 @@ def run(
     needs.check_run(scene, specs, levels)
     if bounces is None:
         bounces, left_out = enough_bounces(scene, tracer, seed)
-    else:
+    elif not before:
         left_out = light_left_out(scene, tracer, bounces, seed)
+    if keep is not None:
+        fixed = None if isinstance(walked, Iterator) else max(r.stop for r in walked)
+        about = {"grid": grid, "bounces": bounces, "left_out": left_out, "paths": fixed}
+        keep.choose({**about, "plan": asdict(plan) if isinstance(plan, Plan) else plan})
     baked = bake(
         scene, specs, levels, chosen[0], tracer, chosen[2],
-        paths=walked, bounces=bounces, seed=seed, map=map, progress=progress,
+        paths=walked, bounces=bounces, seed=seed, map=map, progress=progress, keep=keep,
     )  # fmt: skip
     for field, holes in zip(scene.fields, baked.holes):
         if holes:
@@ -163,7 +177,7 @@ def run(
         "holes": list(baked.holes),
         "seconds": {stage: round(seconds, 3) for stage, seconds in baked.seconds.items()},
         "relative_error": [grid.relative_error for grid in baked.grids],
-        "plan": None if plan is None else asdict(plan),
+        "plan": asdict(plan) if isinstance(plan, Plan) else plan,
         "reached": None,
         "reached_uncertain": None,
         "reached_on_walls": None,
@@ -205,6 +219,13 @@ def judged(light: Illumination, backend: Backend) -> Illumination:
     reached = {"reached": found.rmse, "reached_uncertain": found.uncertain}
     walls = None if on_walls is None else on_walls.rmse
     return replace(light, recipe={**recipe, **reached, "reached_on_walls": walls})
+
+
+def _gone_on_with(before: dict[str, Any], paths: int | None) -> list[range]:
+    """Ranges of paths of a run that was stopped, or of a finished one, and as many more as are asked for now."""
+    ranges = [range(start, stop) for start, stop in before.get("walked", ())]
+    done, asked = max((r.stop for r in ranges), default=0), paths or before["paths"] or 0
+    return [*ranges, range(done, asked)] if asked > done else ranges
 
 
 def _shines(scene: Scene) -> bool:

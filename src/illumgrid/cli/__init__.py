@@ -75,13 +75,15 @@ def in_options(sentence: str) -> str:
 def guarded(command: Callable[[], Any]) -> int:
     """Exit code of a command."""
     disk.written.clear()
+    disk.kept.clear()
     try:
         code = command()
         if code == 130:  # what typer makes of Ctrl-C
             raise KeyboardInterrupt
         return code if isinstance(code, int) else 0
     except (typer.Abort, KeyboardInterrupt):
-        what = f"{disk.written[0]} is written and complete" if disk.written else "nothing was written"
+        done = [f"{place} is written and complete" for place in disk.written if not place.name.endswith(".partial")]
+        what = next(iter([*disk.kept, *done]), "nothing was written")
         say(f"illumgrid: stopped; {what}")
         return 130
     except BadInput as error:

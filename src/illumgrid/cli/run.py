@@ -3,7 +3,7 @@
 import shlex
 import sys
 from collections.abc import Callable, Sequence
-from contextlib import suppress
+from contextlib import closing, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from illumgrid.cli.long import kept, shared_out, spread
 from illumgrid.cli.reading import Array, Channel, Crop, Downsample, Label, Spacing, Time, check_inside, given, labels_of
 from illumgrid.cli.terminal import Ignore, omitted_light, progress_bars, reported_warnings, say
 from illumgrid.errors import BadInput, shown_range, tell
@@ -249,11 +250,30 @@ def run(
     ] = None,
     no_preview: Annotated[bool, typer.Option("--no-preview", help="Leave the picture out.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a finished run in DIR.")] = False,
+    resume: Annotated[
+        bool,
+        typer.Option("--resume", help="Go on: with what a stopped run left, or with more --paths on a finished DIR."),
+    ] = False,
+    workers: Annotated[
+        int | None, typer.Option(min=1, metavar="N", help="So many processes on this machine, by dask.distributed.")
+    ] = None,
+    dask: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="The workers of a dask scheduler, such as tcp://host:8786.")
+    ] = None,
+    any_machine: Annotated[
+        bool,
+        typer.Option(
+            "--any-machine",
+            help="Accept another processor or other versions, among workers or since a run was stopped: the same light "
+            "then, but for its last digits.",
+        ),
+    ] = False,
     ignore: Ignore = None,
 ) -> None:
     """Light a volume, the volumes of a scene file, or a built-in scene, for all isovalues at once.
 
-    DIR then holds illumination.exr, run.json and preview.png, and needs nothing else.
+    DIR then holds illumination.exr, run.json and preview.png, and needs nothing else. A long run keeps what it has
+    finished in DIR.partial: after a stop the same command goes on from there.
     """
     from illumgrid.chain import run as light_up
     from illumgrid.field.diagnosis import diagnose
@@ -272,9 +292,21 @@ def run(
             grid, paths = grid or asked.preset.grid, paths or asked.preset.paths
             isovalues = isovalues or asked.preset.isovalues
         folder = output or Path(f"{asked.name}-light")
-        store.claim(folder, overwrite)
+        if not (resume and store.is_run(folder)):
+            store.claim(folder, overwrite)
         scene = _in_harmonics(asked.make(smooth or 0.0), lights, degree)
         scene = with_texels(scene, texels) if texels else scene
+        numbers: dict[str, Any] = {
+            "grid": grid,
+            "paths": paths,
+            "bounces": bounces,
+            "isovalues": isovalues,
+            "seed": seed,
+        }
+        keep = kept(folder, scene, stages, resume, overwrite, any_machine, error=error, seconds=seconds, **numbers)
+        if keep is None:
+            say(f"{folder} is finished, and holds as many paths: nothing is left to do")
+            return
         for field in scene.fields:
             shape = " x ".join(map(str, field.volume.shape))
             say(f"{field.name}: {shape} voxels, isovalues {shown_range(field.range)}")
@@ -284,14 +316,15 @@ def run(
                     say(f"  smoothed that far: {_again(finding.options)}")
         if backend == "auto":
             say(_why_auto())
-        with progress_bars() as progress:
+        with closing(keep), spread(workers, dask, any_machine) as over, progress_bars(keep.standing) as progress:
             light = light_up(
-                scene, **stages, grid=grid, paths=paths, bounces=bounces, isovalues=isovalues, seed=seed,
-                error=error, seconds=seconds, judge=False, progress=progress,
+                scene, **shared_out(stages, workers), **numbers, error=error, seconds=seconds, judge=False,
+                map=over, progress=progress, keep=keep,
             )  # fmt: skip
         about = {"input": asked.name if source is None else source, "reading": reading, "smooth": smooth or 0.0}
         light = replace(light, recipe={**light.recipe, **about, "warnings": sentences})
-        _save(light, folder, not no_preview, overwrite)
+        _save(light, folder, not no_preview, overwrite or resume)
+        keep.leave(folder)
         light = _judged(light, stages, folder)
         about = {key: light.recipe[key] for key in ("reached", "reached_uncertain", "reached_on_walls")}
         store.amend(folder, {**about, "warnings": sentences})

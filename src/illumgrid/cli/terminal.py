@@ -4,7 +4,7 @@ import logging
 import time
 import unicodedata
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -78,38 +78,57 @@ def say_what_compiles() -> None:
 
 
 @contextmanager
-def progress_bars() -> Iterator["Progress"]:
-    """Progress of long work: a bar with the time left on a terminal, elsewhere a line every `INTERVAL` seconds."""
+def progress_bars(about: Callable[[], str] = lambda: "") -> Iterator["Progress"]:
+    """Progress of long work: a bar with the time left on a terminal, elsewhere a line every `INTERVAL` seconds.
+
+    What `about` says at the time is added.
+    """
     from rich.console import Console
 
     console = Console(stderr=True)
     if not console.is_terminal:
-        yield _progress_lines()
+        yield _progress_lines(about)
         return
     from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
     bars: dict[str, Any] = {}
-    columns = TextColumn("{task.description:<6}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn()
+    columns = (
+        TextColumn("{task.description:<6}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn(),
+        TextColumn("{task.fields[about]}"),
+    )  # fmt: skip
     with Progress(*columns, console=console, transient=True) as progress:
 
         def report(what: str, done: int, total: int) -> None:
             if what not in bars:
-                bars[what] = progress.add_task(what, total=max(total, 1))
-            progress.update(bars[what], completed=done)
+                bars[what] = progress.add_task(what, total=max(total, 1), about="")
+            progress.update(bars[what], completed=done, about=about())
 
         yield report
 
 
-def _progress_lines() -> "Progress":
+def _progress_lines(about: Callable[[], str]) -> "Progress":
     last = time.monotonic()
+    begun: dict[str, tuple[float, int]] = {}  # when, and with how much done already
 
     def report(what: str, done: int, total: int) -> None:
         nonlocal last
-        if time.monotonic() - last >= INTERVAL:
-            last = time.monotonic()
-            say(f"{what}: {done / max(total, 1):.0%}")
+        now = time.monotonic()
+        since, before = begun.setdefault(what, (now, done))
+        if now - last >= INTERVAL:
+            last = now
+            left = (now - since) * (total - done) / (done - before) if done > before else None
+            more = [] if left is None else [f"{_duration(left)} left"]
+            say(", ".join([f"{what}: {done / max(total, 1):.0%}", *more, *filter(None, [about()])]))
 
     return report
+
+
+def _duration(seconds: float) -> str:
+    """A time in words, about."""
+    for unit, size in (("h", 3600), ("min", 60)):
+        if seconds >= 2 * size:
+            return f"about {seconds / size:.0f} {unit}"
+    return f"about {seconds:.0f} s"
 
 
 def omitted_light(recipe: Mapping[str, Any]) -> str:

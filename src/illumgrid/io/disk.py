@@ -24,6 +24,8 @@ STOPS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") 
 
 written: list[Path] = []
 """What this process has put in place, in order: the truth to tell when it is stopped."""
+kept: list[str] = []
+"""What a stopped process has kept of its work, as a sentence; empty where there is nothing."""
 
 
 @contextmanager
@@ -103,13 +105,13 @@ def make_parents(place: Path) -> None:
 def beside(place: Path) -> Iterator[Path]:
     """Give an empty hidden folder beside `place`, which is gone afterwards; those of dead processes go first."""
     sweep(place)
-    work, lock = _hidden(place)
+    work, handle = _hidden(place)
     try:
         yield work
     finally:
         shutil.rmtree(work, ignore_errors=True)
-        if lock is not None:
-            os.close(lock)
+        if handle is not None:
+            os.close(handle)
 
 
 def _hidden(place: Path) -> tuple[Path, int | None]:
@@ -117,12 +119,12 @@ def _hidden(place: Path) -> tuple[Path, int | None]:
     while True:
         work = Path(tempfile.mkdtemp(prefix=f".{place.name[:50]}-", dir=place.parent))  # cut, or it would get too long
         try:
-            return work, _lock(work)
+            return work, lock(work)
         except FileNotFoundError:  # swept before it was locked
             continue
 
 
-def _lock(folder: Path) -> int | None:
+def lock(folder: Path) -> int | None:
     """Lock a folder until the process ends; None where that is not known. BlockingIOError if another holds it."""
     try:
         import fcntl
@@ -151,8 +153,8 @@ def sweep(place: Path) -> None:
             with suppress(OSError):  # another process is at work in it, or it is not ours
                 if found.is_symlink() or not all(p.stem in ("new", "old") for p in found.iterdir()):
                     continue
-                lock = _lock(found)
-                if lock is None:
+                handle = lock(found)
+                if handle is None:
                     continue
                 try:
                     if (found / "old").is_dir() and not os.path.lexists(place):  # killed between two renames
@@ -160,7 +162,7 @@ def sweep(place: Path) -> None:
                         _fsync(place.parent, os.O_RDONLY)
                     shutil.rmtree(found, ignore_errors=True)
                 finally:
-                    os.close(lock)
+                    os.close(handle)
 
 
 @contextmanager

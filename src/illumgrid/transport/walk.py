@@ -2,7 +2,7 @@
 
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol
 
@@ -17,22 +17,33 @@ PIECE = 1 << 17
 """Paths in the first piece of work."""
 SECONDS = 2.0
 """That a piece should take: later ones are sized by the pace of those before."""
+GROWTH = 4.0
+"""How many times larger, or smaller, the next piece may be."""
 
-Rank = Callable[[Queries], NDArray[np.integer]]
-"""Numbers (n,) by which targets are walked from, lowest first."""
+Ranks = Sequence[NDArray[np.integer]]
+"""For each batch numbers (n,) by which its targets are walked from, lowest first."""
 
 
 class Keeper(Protocol):
-    """Keeps answers while a walk goes on, and gives back those of a walk that was stopped: `illumgrid.io.partial`."""
+    """Keeps answers while a walk goes on, and gives back those of a walk that was stopped: `illumgrid.io.partial`.
+
+    A row is the place of a target in all batches, one after the other.
+    """
+
+    def begin(self, targets: Sequence[Queries], order: NDArray[np.int64]) -> None:
+        """Learn what is asked, and the rows in the order in which their answers will come."""
 
     def known(self, targets: Sequence[Queries], paths: range) -> Samples | None:
-        """Answers to all targets, one batch after the other, with paths -1 where none is known; None without any."""
+        """Answers of all rows, with paths -1 where none is known; None without any."""
 
     def keep(self, rows: NDArray[np.int64], answer: "Answer") -> None:
-        """Take the answers to some targets, given by their places in all batches one after the other."""
+        """Take the answers of some rows."""
 
     def flush(self) -> None:
-        """Bring to the disk what was taken."""
+        """Bring to the disk what was taken, if that is worth it."""
+
+    def end(self, samples: Samples) -> None:
+        """Take the moments of all paths of all rows, in the end."""
 
 
 class Answer(NamedTuple):
@@ -71,12 +82,12 @@ class Walk:
     targets: Sequence[Queries]
     ranges: Sequence[range]
     answers: list[Samples | None]
-    size: float = PIECE
+    size: float = field(default_factory=lambda: float(PIECE))
     asked: deque[tuple[int, NDArray[np.int64]]] = field(default_factory=deque)
 
-    def pieces(self, rank: Rank | None = None) -> Iterator[tuple[Queries, range]]:
+    def pieces(self, ranks: Ranks | None = None) -> Iterator[tuple[Queries, range]]:
         """What is not known yet, as it is asked for: targets of a low rank in all batches first."""
-        ranks = [np.zeros(len(q), np.int8) if rank is None else rank(q) for q in self.targets]
+        ranks = ranks or [np.zeros(len(q), np.int8) for q in self.targets]
         for now in sorted({int(r) for each in ranks for r in np.unique(each)}):
             for number, (queries, paths, known) in enumerate(zip(self.targets, self.ranges, self.answers)):
                 due = ranks[number] == now
@@ -90,7 +101,7 @@ class Walk:
         """Put the answer to the piece that has waited longest in its place; returns the batch and the rows in it."""
         number, rows = self.asked.popleft()
         pace = len(rows) * len(self.ranges[number]) / max(found.seconds, 1e-3)
-        self.size = min(max(pace * SECONDS, self.size / 4, 1.0), 4 * self.size)
+        self.size = min(max(pace * SECONDS, self.size / GROWTH, 1.0), GROWTH * self.size)
         queries, arrays = self.targets[number], found[:3]
         if len(rows) == len(queries):
             self.answers[number] = Samples(queries, *arrays, found.channels)
@@ -103,6 +114,11 @@ class Walk:
         for own, new in zip((whole.light, whole.spread, whole.paths), arrays):
             own[rows] = new
         return number, rows
+
+
+def in_order(ranks: Ranks) -> NDArray[np.int64]:
+    """Rows of all batches, in the order of `Walk.pieces`."""
+    return np.argsort(np.concatenate(ranks), kind="stable")
 
 
 def split(whole: Samples | None, targets: Sequence[Queries]) -> list[Any]:

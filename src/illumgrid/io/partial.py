@@ -1,0 +1,392 @@
+"""A run on its way: the light that it has finished, in ``DIR.partial`` beside its DIR.
+
+``light.zarr`` is a Zarr v3 group. For each range of paths it has a group ``0-32`` with the arrays ``light`` and
+``spread`` (n, C) and ``paths`` (n,): a row for each node or texel asked about, in the order in which they are walked
+from; paths is -1 where nothing is known. The library writes each chunk whole; ``paths`` is written last, so that a row
+counts when all of it is there. The attributes say of which run this is, and what that run had chosen. ``scene`` is a
+finished run's folder without light, so that a picture needs nothing else.
+
+A finished run keeps its moments in ``moments.npz``: more paths go on from there.
+"""
+
+import hashlib
+import json
+import os
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, fields, is_dataclass
+from importlib.metadata import version
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from illumgrid.errors import BadInput
+from illumgrid.field.scene import Scene
+from illumgrid.grid import Channels
+from illumgrid.io import disk
+from illumgrid.io.store import MOMENTS
+from illumgrid.transport.samples import Queries, Samples, join_queries
+from illumgrid.transport.walk import Answer
+
+Record = dict[str, Any]
+
+FORMAT = 1
+EVERY = 10.0
+"""Seconds from one writing to the next, and before the first: a shorter run leaves nothing."""
+CHUNK = 4096
+"""Rows of a chunk."""
+SUFFIX, LIGHT, SCENE = ".partial", "light.zarr", "scene"
+MACHINE = ("versions", "processor")
+"""What may differ where --any-machine is given: then light may differ in its last digits."""
+
+
+def digest(thing: Any) -> str:
+    """Digest of dataclasses, arrays, and what JSON has, by content."""
+    found = hashlib.sha256()
+    _hash(thing, found.update)
+    return found.hexdigest()
+
+
+def _hash(thing: Any, update: Callable[[Any], None]) -> None:
+    if is_dataclass(thing) and not isinstance(thing, type):
+        update(type(thing).__name__.encode())
+        for f in fields(thing):
+            update(f.name.encode())
+            _hash(getattr(thing, f.name), update)
+    elif isinstance(thing, np.ndarray):
+        update(f"{thing.dtype.str}{thing.shape}".encode())
+        for slab in thing if thing.ndim > 1 else (thing,):
+            update(np.ascontiguousarray(slab).view(np.uint8).data)
+    elif isinstance(thing, list | tuple):
+        update(f"{len(thing)}[".encode())
+        for each in thing:
+            _hash(each, update)
+    elif thing is None or isinstance(thing, str | int | float | np.generic):
+        update(f"{type(thing).__name__} {thing!r}".encode())
+    else:
+        raise TypeError(f"{type(thing).__name__} has no digest")
+
+
+def identity(scene: Scene, stages: Mapping[str, Any], **asked: float | None) -> Record:
+    """What decides a run's light, with a digest for whatever is large.
+
+    Parameters
+    ----------
+    scene : Scene
+    stages : mapping
+        Sampler, backend and interpolator.
+    **asked
+        Numbers that the user gave.
+    """
+    from llvmlite.binding import get_host_cpu_name
+
+    given: Record = dict(asked)
+    for kind, stage in stages.items():
+        options = {name: value for name, value in asdict(stage).items() if name != "threads"}  # which decide no light
+        given |= {kind: {"name": stage.name, **options}}
+    given |= {"versions": {name: version(name) for name in ("illumgrid", "numba", "numpy", "scipy")}}
+    given |= {"processor": get_host_cpu_name()}
+    about = {f"field {field.name!r}": digest(field) for field in scene.fields}
+    surroundings = {f.name: digest(getattr(scene, f.name)) for f in fields(scene) if f.name != "fields"}
+    return dict(json.loads(json.dumps({**about, **surroundings, **given})))
+
+
+def differences(one: Record, other: Record) -> list[str]:
+    """What two runs do not have in common, in words."""
+    found = []
+    for key in sorted(one.keys() | other.keys()):
+        a, b = one.get(key), other.get(key)
+        if a != b:
+            short = all(isinstance(x, str | int | float | None) and len(str(x)) < 20 for x in (a, b))
+            found.append(f"{key} ({a}, not {b})" if short else key)
+    return found
+
+
+class Partial:
+    """What a run has finished: keeps it, and gives it to a run that goes on; a `illumgrid.transport.walk.Keeper`.
+
+    Parameters
+    ----------
+    folder : path
+        Of the finished run; this one is beside it.
+    about : dict
+        The `identity` of the run.
+    command : str
+        The command line, to be shown.
+    scene : callable, optional
+        Writes the scene to a folder that does not exist yet.
+    """
+
+    def __init__(
+        self, folder: Path, about: Record, command: str, scene: Callable[[Path], None] = lambda folder: None
+    ) -> None:
+        self.place = beside(folder)
+        self.about, self.command, self.write_scene = about, command, scene
+        self.chosen: Record | None = None  # by the run that is gone on with: grid, bounces, walked...
+        self.moments: Samples | None = None
+        self._before: dict[str, NDArray[Any]] = {}
+        self._group: Any = None
+        self._lock: int | None = None
+        self._new: list[tuple[range, NDArray[np.int64], Answer]] = []
+        self._last = time.monotonic()
+        self._walked: list[range] = []
+        self._stored, self._count, self._asked = 0, 0, ""
+
+    # --- what is there -------------------------------------------------------------------------------------------
+
+    def resume(self, finished: Path | None, overwrite: bool, any_machine: bool) -> bool:
+        """Take up what an earlier process left beside, or in the folder of a `finished` run; whether there is anything.
+
+        Raises
+        ------
+        BadInput
+            If it is of another run, or another process is at work on it.
+        """
+        if not self.place.is_dir():
+            return finished is not None and self._resume_finished(finished, any_machine)
+        with disk.sentences(f"{self.place} cannot be gone on with", "remove it, or choose another folder"):
+            group = opened(self.place)
+            kept = dict(group.attrs)
+        other = self._differences(kept["identity"], any_machine)
+        if other and overwrite:
+            return False
+        if other:
+            raise BadInput(
+                f"{self.place} holds a part of another run, which differs in {', '.join(other)}; expected the command "
+                f"that began it, {kept['command']}, or overwrite=True to begin anew"
+            )
+        self._lock = _locked(self.place)
+        disk.kept[:] = [f"what {self.place} holds is kept"]
+        self._group, self._asked = group, kept["queries"]
+        self.chosen = {**kept["chosen"], "walked": [[int(end) for end in name.split("-")] for name in _ranges(group)]}
+        return True
+
+    def _resume_finished(self, finished: Path, any_machine: bool) -> bool:
+        if not (finished / MOMENTS).is_file():
+            return False
+        with disk.sentences(f"{finished / MOMENTS} cannot be used", "remove it: all paths are then walked again"):
+            with np.load(finished / MOMENTS, allow_pickle=False) as arrays:
+                self._before = {name: arrays[name] for name in arrays.files}
+            kept = json.loads(str(self._before["about"]))
+        if other := self._differences(kept["identity"], any_machine):
+            self._before = {}
+            raise BadInput(
+                f"{finished} holds another run, which differs in {', '.join(other)}; pass overwrite=True to begin "
+                "anew, or choose another folder"
+            )
+        self._asked = kept["queries"]
+        self.chosen = {**kept["chosen"], "walked": [[0, int(self._before["walked"])]]}
+        return True
+
+    def _differences(self, kept: Record, any_machine: bool) -> list[str]:
+        """Fewer paths are another run; more go on."""
+        free = set(MACHINE) if any_machine else set()
+        if None not in (self.about.get("paths"), kept.get("paths")) and self.about["paths"] >= kept["paths"]:
+            free.add("paths")
+        return [d for d in differences(kept, self.about) if d.partition(" (")[0] not in free]
+
+    # --- what comes in -------------------------------------------------------------------------------------------
+
+    def choose(self, chosen: Record) -> None:
+        """Take down what was chosen, which a run that goes on takes over."""
+        self.chosen = dict(json.loads(json.dumps(chosen)))
+
+    def begin(self, targets: Sequence[Queries], order: NDArray[np.int64]) -> None:
+        """See `Keeper`."""
+        self._count, self._place = len(order), np.empty(len(order), np.int64)
+        self._place[order] = np.arange(len(order))
+        found = hashlib.sha256()
+        for queries in targets:
+            _hash(queries, found.update)
+        if self._asked not in ("", found.hexdigest()):
+            raise BadInput(f"{self.place} is of other points than the sampler asks about now; remove it to begin anew")
+        self._asked, self._last = found.hexdigest(), time.monotonic()
+
+    def known(self, targets: Sequence[Queries], paths: range) -> Samples | None:
+        """See `Keeper`."""
+        self._walked.append(paths)
+        self._stored, name, queries = 0, _name(paths), join_queries(targets)
+        if self._before and name == f"0-{self._before['walked']}":
+            light, spread, count = (self._before[key] for key in ("light", "spread", "paths"))
+            channels = _channels(json.loads(str(self._before["about"]))["channels"])
+            self._new.append((paths, self._place, Answer(light, spread, count, channels, 0.0)))
+            return Samples(queries, light, spread, count, channels)
+        if self._group is None or name not in _ranges(self._group):
+            return None
+        with disk.sentences(f"{self.place} cannot be gone on with", "remove it to begin anew"):
+            part = self._group[name]
+            light, spread, count = (part[key][:][self._place] for key in ("light", "spread", "paths"))
+            self._stored = int((count >= 0).sum())
+            self._tell()
+            return Samples(queries, light, spread, count, _channels(part.attrs["channels"]))
+
+    def keep(self, rows: NDArray[np.int64], answer: Answer) -> None:
+        """See `Keeper`."""
+        self._new.append((self._walked[-1], self._place[rows], answer))
+        if time.monotonic() - self._last >= EVERY:
+            self._write()
+
+    def flush(self) -> None:
+        """See `Keeper`."""
+        if self._group is not None:
+            self._write()
+
+    def end(self, samples: Samples) -> None:
+        """See `Keeper`."""
+        self.moments = samples
+        self._before = {}
+
+    def standing(self) -> str:
+        """What is kept where, for a line of progress; empty before anything is."""
+        blocks, of = self._stored // CHUNK, -(-self._count // CHUNK)
+        return "" if self._group is None else f"{blocks} of {of} blocks of light are kept in {self.place.name}"
+
+    # --- the disk ------------------------------------------------------------------------------------------------
+
+    def _write(self) -> None:
+        if not self._new:
+            return
+        remedy = "what it holds stays valid, and the same command goes on from there"
+        with disk.sentences(f"{self.place} could not be written; the disk may be full", remedy):
+            if self._group is None:
+                self._create()
+            with disk.held():
+                for paths in dict.fromkeys(p for p, _, _ in self._new):
+                    some = [(rows, answer) for p, rows, answer in self._new if p == paths]
+                    self._stored = self._add(paths, some) + (self._stored if paths == self._walked[-1] else 0)
+                self._new.clear()
+                self._last = time.monotonic()
+        self._tell()
+
+    def _tell(self) -> None:
+        share = f"{self._stored / max(self._count, 1):.0%} of the light is kept in {self.place}"
+        disk.kept[:] = [f"{share}; the same command goes on from there"]
+
+    def _add(self, paths: range, some: list[tuple[NDArray[np.int64], Answer]]) -> int:
+        """Write answers to some rows of a range of paths; returns how many."""
+        part, rows = self._part(paths, some[0][1].channels), np.concatenate([r for r, _ in some])
+        order = np.argsort(rows, kind="stable")
+        rows = rows[order]
+        ends = [*np.flatnonzero(np.diff(rows, prepend=-2) != 1).tolist(), len(rows)]
+        for key, column in (("light", 0), ("spread", 1), ("paths", 2)):  # paths last: they make the others count
+            values = np.concatenate([answer[column] for _, answer in some])[order]
+            for a, b in pairwise(ends):
+                part[key][rows[a] : rows[a] + b - a] = values[a:b]
+            self._sync(part, key, rows)
+        return len(rows)
+
+    def _create(self) -> None:
+        import zarr
+
+        place = Path(os.path.abspath(self.place))
+        disk.make_parents(place)
+        with disk.beside(place) as work:
+            self.write_scene(work / "new" / SCENE)
+            group = zarr.create_group(str(work / "new" / LIGHT), zarr_format=3)
+            group.attrs.update(
+                {
+                    "format": FORMAT, "identity": self.about, "command": self.command, "chosen": self.chosen,
+                    "queries": self._asked, "rows": self._count,
+                }
+            )  # fmt: skip
+            if place.is_dir():  # of another run, which was to be overwritten
+                place.rename(work / "old.part")
+            disk.put(work / "new", place, os.rename)
+        self._lock = _locked(place)
+        self._group = opened(place)
+
+    def _part(self, paths: range, channels: Channels) -> Any:
+        from zarr.codecs import Crc32cCodec, ZstdCodec
+
+        name, known = _name(paths), {"names": channels.names, "mix": channels.mix}
+        if name in _ranges(self._group):
+            if _channels(self._group[name].attrs["channels"]) != channels:
+                raise BadInput("the light has other channels than before")
+            return self._group[name]
+        part = self._group.create_group(name, attributes={"channels": known})
+        codecs = {"compressors": [ZstdCodec(level=1), Crc32cCodec()]}
+        for key in ("light", "spread"):
+            shape = self._count, len(channels)
+            part.create_array(key, shape=shape, chunks=(CHUNK, shape[1]), dtype="float32", **codecs)
+        part.create_array("paths", shape=(self._count,), chunks=(CHUNK,), dtype="int32", fill_value=-1, **codecs)
+        return part
+
+    def _sync(self, part: Any, key: str, rows: NDArray[np.int64]) -> None:
+        """Bring the chunks of these rows to the disk: the library renames them, and leaves the rest to the system."""
+        for chunk in np.unique(rows // CHUNK).tolist():
+            file = Path(self.place, LIGHT, part.path, key, "c", str(chunk), *(() if key == "paths" else ("0",)))
+            disk.sync(file)
+
+    def leave(self, finished: Path) -> None:
+        """Give the finished run its moments, and remove the partial one."""
+        samples = self.moments
+        if samples is not None:
+            walked = self._walked[-1].stop
+            channels = {"names": samples.channels.names, "mix": samples.channels.mix}
+            about = {"identity": self.about, "chosen": self.chosen, "queries": self._asked, "channels": channels}
+            with disk.fresh_file(finished / MOMENTS) as file:
+                np.savez_compressed(
+                    file, about=np.array(json.dumps(about)), walked=np.array(walked),
+                    light=samples.light, spread=samples.spread, paths=samples.paths,
+                )  # fmt: skip
+        self.remove()
+
+    def remove(self) -> None:
+        """Remove the partial run, whole or not at all."""
+        place = Path(os.path.abspath(self.place))
+        if place.is_dir():  # ours, or of a run that was to be overwritten
+            with disk.beside(place) as work:
+                place.rename(work / "new")
+        self.close()
+        self._group = None
+        disk.kept.clear()
+
+    def close(self) -> None:
+        """Let other processes go on with it."""
+        if self._lock is not None:
+            os.close(self._lock)
+        self._lock = None
+
+
+def beside(folder: Path) -> Path:
+    """Where the partial run of a folder is."""
+    return folder.with_name(folder.name + SUFFIX)
+
+
+def opened(place: Path) -> Any:
+    """The group of a partial run.
+
+    Raises
+    ------
+    BadInput
+        If it is none.
+    """
+    import zarr
+
+    group = zarr.open_group(str(place / LIGHT), mode="r+", zarr_format=3)
+    if group.attrs.get("format") != FORMAT:
+        raise BadInput(f"its format is {group.attrs.get('format')!r}; expected {FORMAT}")
+    return group
+
+
+def _name(paths: range) -> str:
+    return f"{paths.start}-{paths.stop}"
+
+
+def _ranges(group: Any) -> list[str]:
+    """Names of the ranges of paths in a group, in their order."""
+    return sorted((name for name, _ in group.groups() if "-" in name), key=lambda name: int(name.split("-")[0]))
+
+
+def _channels(about: Record) -> Channels:
+    return Channels(tuple(about["names"]), tuple((float(r), float(g), float(b)) for r, g, b in about["mix"]))
+
+
+def _locked(place: Path) -> int | None:
+    try:
+        return disk.lock(place)
+    except BlockingIOError:
+        raise BadInput(f"another process is at work on {place}; wait for it, or choose another folder") from None
