@@ -9,11 +9,12 @@ import OpenEXR
 import pytest
 
 from illumgrid.errors import BadInput
-from illumgrid.field.scene import Field, Levels, Material, Quad, Scene
-from illumgrid.field.volume import Volume
+from illumgrid.field.scene import Field, Levels, Material, Quad, Scene, level_table
+from illumgrid.field.volume import NATIVE, Volume
 from illumgrid.grid import GREY, RGB, Channels, GridSpec, IlluminationGrid, WallTexture
 from illumgrid.io import store
 
+CHANNELS = (3,), (), ()
 MIRRORED = ((0, 0, -1), (1, 0, 0), (0, 1, 0))
 ODD = np.array([0.0, -0.0, 1e-42, np.inf, 3.4e38, 1 / 3, np.nan], np.float32)
 
@@ -127,12 +128,13 @@ def test_other_programs_find_the_documented_layout(tmp_path):
         "wall/lamp",
     ]
     field, light = parts["field/protons"], parts["light/protons"]
-    assert (field.width(), field.height(), set(field.channels)) == (4, 7 * 5, {"Y"})
+    assert (field.width(), field.height(), set(field.channels)) == (5, 4 * 7, {"Y"})
     assert set(light.channels) == {"R", "G", "B", "error", "support"}
-    assert field.header["layout"] == "array (nx, ny, nz) = (4, 7, 5); row = z*ny + y, column = x"
+    assert field.header["layout"] == "array (nx, ny, nz) = (4, 7, 5) of float32; row = x*ny + y, column = z"
+    assert light.header["layout"].endswith("; row = z*ny + y, column = x")
     assert field.compression() == OpenEXR.ZIP_COMPRESSION and field.type() == OpenEXR.scanlineimage
     x, y, z = 1, 6, 3
-    assert field.channels["Y"].pixels[z * 7 + y, x] == stored.scene.fields[0].volume.values[x, y, z]
+    assert field.channels["Y"].pixels[x * 7 + y, z] == stored.scene.fields[0].volume.values[x, y, z]
     own = stored.grids[0]
     row, column = z * own.spec.shape[1] + y, x
     found = [light.channels[c].pixels[row, column] for c in ("R", "G", "B", "error", "support")]
@@ -144,6 +146,43 @@ def test_other_programs_find_the_documented_layout(tmp_path):
     found = [texels.channels[c].pixels[k * 2 + v, u] for c in ("R", "G", "B", "support")]
     assert found == [*stored.walls[0].values[k, v, u], stored.walls[0].support[k, v, u]]
     assert {c.pixels.dtype for p in parts.values() for c in p.channels.values()} == {np.dtype(np.float32)}
+
+
+@pytest.mark.parametrize("kind", [kind.name for kind in NATIVE])
+@pytest.mark.parametrize("nz", [5, 8])
+def test_fields_come_back_in_their_type(tmp_path, kind, nz):
+    values = np.random.default_rng(0).integers(-100, 100, (4, 3, nz)).astype("int8").view("u1").astype(kind)
+    values[0, 0, :2] = np.iinfo(kind).min if kind != "float32" else -1e38, 77
+    volume = Volume(values, slope=0.5, intercept=-3.0)
+    scene = Scene.sky(volume, range=volume.extremes)
+    grid = IlluminationGrid(
+        GridSpec.over(volume, 3), *(np.ones((*GridSpec.over(volume, 3).shape, *c)) for c in CHANNELS)
+    )
+    store.write(tmp_path / "out", store.Stored(scene, level_table(scene, 2), (grid,), (), {}), None, False)
+    back = store.read(tmp_path / "out").scene.fields[0].volume
+    assert back.values.dtype == kind and np.array_equal(back.values, values) and back.extremes == volume.extremes
+    part = {p.name(): p for p in OpenEXR.File(str(tmp_path / "out" / store.EXR), separate_channels=True).parts}[
+        "field/field"
+    ]
+    ((name, channel),) = part.channels.items()
+    assert name == ("Y" if kind == "float32" else "bytes")
+    assert np.array_equal(channel.pixels.view(kind)[2 * 3 + 1][:nz], values[2, 1])
+
+
+def test_a_run_is_described_without_its_pixels(tmp_path, monkeypatch):
+    stored = example(2)
+    store.write(tmp_path / "out", stored, None, False)
+    monkeypatch.setattr(store, "_digest", None)
+    monkeypatch.setattr(store.exr, "read", None)
+    record = store.describe(tmp_path / "out")
+    for about, field, grid in zip(record["scene"]["fields"], stored.scene.fields, stored.grids):
+        assert tuple(about["extremes"]) == field.volume.extremes
+        assert sum(about["histogram"]) == field.volume.values.size
+        assert record["grids"][field.name]["lit"] == (grid.support > 0).mean()
+    text = (tmp_path / "out" / store.RUN).read_text("utf-8")
+    (tmp_path / "out" / store.RUN).write_text(text.replace('"lit": ', '"lit": 0'))
+    with pytest.raises(BadInput, match=r"run\.json"):
+        store.describe(tmp_path / "out")
 
 
 def test_grey_light_takes_one_channel_of_the_file(tmp_path):
@@ -184,6 +223,20 @@ def test_a_run_of_format_1_still_loads():
         assert np.array_equal(wall.values[..., c].reshape(4, 3), parts["wall/wall"].channels[name].pixels)
     assert grid.values.sum(dtype=float) == pytest.approx(287.47772097587585, rel=1e-12)
     assert np.isfinite(grid.lookup([[1.5, 4.0, 0.5]])).all()
+
+
+def test_a_run_of_format_2_still_loads():
+    """Written by the version before fields kept their types, of a ball of whole numbers in the light of a studio."""
+    folder = Path(__file__).with_name("format_2")
+    back, record = store.read(folder), store.describe(folder)
+    parts = {p.name(): p for p in OpenEXR.File(str(folder / store.EXR), separate_channels=True).parts}
+    field = back.scene.fields[0].volume
+    assert np.array_equal(field.values, parts["field/ball"].channels["Y"].pixels.reshape(7, 6, 5).transpose(2, 1, 0))
+    assert field.values.dtype == np.float32 and field.intercept == 3 and back.grids[0].spec.shape == (3, 4, 4)
+    assert field.extremes == tuple(record["scene"]["fields"][0]["extremes"])
+    assert np.array_equal(field.values, field.values.round()) and field.values.sum() == 8964
+    assert back.grids[0].channels.names == ("R", "G", "B", "key.Y", "dome.Y")
+    assert back.grids[0].light.sum(dtype=float) == pytest.approx(304.85302293286077, rel=1e-12)
 
 
 def test_without_a_picture_there_is_none_and_others_may_read(tmp_path):

@@ -24,6 +24,7 @@ def out(tmp_path: Path) -> Path:
 def reseal(folder: Path, **changes) -> None:
     """Forge the record so that its checksum matches the current content."""
     record = json.loads((folder / store.RUN).read_text("utf-8")) | changes
+    record |= {"exr": store._digest(folder / store.EXR)}
     (folder / store.RUN).write_text(json.dumps(record | {"checksum": store._checksum(record, folder / store.EXR)}))
 
 
@@ -48,8 +49,8 @@ def test_a_record_that_is_none(out, text):
 
 
 def test_a_format_of_the_future(out):
-    reseal(out, format=3)
-    with pytest.raises(BadInput, match=r"run\.json .* format is 3; illumgrid .* reads 1 to 2"):
+    reseal(out, format=4)
+    with pytest.raises(BadInput, match=r"run\.json .* format is 4; illumgrid .* reads 1 to 3"):
         store.read(out)
 
 
@@ -67,7 +68,16 @@ def forge(folder: Path, *way: str | int, value: object = None, remove: bool = Fa
     (folder / store.RUN).write_text(json.dumps(record))
 
 
-WAYS = [("recipe",), ("levels",), ("grids",), ("checksum",), ("scene",), ("scene", "fields"), ("scene", "background")]
+WAYS = [
+    ("recipe",),
+    ("levels",),
+    ("grids",),
+    ("checksum",),
+    ("exr",),
+    ("scene",),
+    ("scene", "fields"),
+    ("scene", "background"),
+]
 
 
 @pytest.mark.parametrize("way", WAYS, ids=".".join)
@@ -99,6 +109,7 @@ BAD_ENTRIES = {
     "emission": [None, 1, [-1, 0, 0], [1, 2], {}],
     "range": [[2, 1], [1], [1, 1], 7, [1e6, 2e6], "wide", [None, 1]],
     "inside": [None, 1, "both", ["above"], {}],
+    "type": [None, 4, "float64", "uint8", "int64", ["float32"], {}],
 }
 
 
@@ -135,7 +146,7 @@ def test_numbers_that_json_does_not_have(out, token):
         {"compression": OpenEXR.PIZ_COMPRESSION},
         {"type": OpenEXR.tiledimage},
         {"name": "x"},
-        {"dataWindow": ((1, 0), (4, 34))},
+        {"dataWindow": ((1, 0), (5, 27))},
     ],
     ids=str,
 )

@@ -9,23 +9,20 @@ from illumgrid.cli.reading import Array, Channel, Crop, Downsample, Label, Spaci
 from illumgrid.cli.terminal import Ignore, omitted_light, reported_warnings, result
 
 if TYPE_CHECKING:
-    from illumgrid.field.scene import Quad
-    from illumgrid.field.volume import Side, Volume
-    from illumgrid.grid import WallTexture
+    from collections.abc import Sequence
+
+    from illumgrid.field.volume import Side
 
 BLOCKS = " ▁▂▃▄▅▆▇█"
 PLAIN = " .:-=+*#@"
 """Where the terminal or the pipe has no block characters."""
 
 
-def histogram_line(volume: "Volume", width: int = 64) -> str:
-    """Histogram of the finite values in a line of block characters; heights are logarithmic."""
+def histogram_line(counts: "Sequence[int]") -> str:
+    """Histogram in a line of block characters; heights are logarithmic."""
     import numpy as np
 
-    from illumgrid.field.volume import histogram
-
-    counts, _ = histogram(volume, width)
-    height = np.log1p(counts) / max(np.log1p(counts.max()), 1e-9)
+    height = np.log1p(counts) / max(np.log1p(max(counts)), 1e-9)
     marks = BLOCKS
     try:
         BLOCKS.encode(sys.stdout.encoding or "utf-8")
@@ -83,8 +80,8 @@ def _describe_volume(source: str, limits: tuple[float, float] | None, inside: "S
     from illumgrid.field.labels import around_zero
     from illumgrid.field.lattice import nodes_over
     from illumgrid.field.scene import Field
-    from illumgrid.field.volume import finite
-    from illumgrid.io import needs
+    from illumgrid.field.volume import finite, histogram
+    from illumgrid.io import needs, store
     from illumgrid.io.readers import read_volume, volume_name
 
     labels = labels_of(reading.pop("label", None))
@@ -92,7 +89,7 @@ def _describe_volume(source: str, limits: tuple[float, float] | None, inside: "S
         raise BadInput(f"--label holds {len(labels)} labels; expected one for info; ask for one after another")
     volume = finite(read_volume(source, **reading, label=labels[0] if labels else None), inside)
     needs.check("info", needs.TO_DESCRIBE * volume.values.size, "cut or --downsample the volume")
-    _describe_lattice(volume_name(source), volume)
+    _describe_lattice(volume_name(source), volume, histogram(volume, store.BINS)[0].tolist(), volume.extremes)
     low, high, why = suggest_range(volume, inside)
     if labels:
         (low, high), why = around_zero(volume), "a voxel outside to a voxel inside the surface of the label"
@@ -118,43 +115,45 @@ def three(numbers: Any) -> str:
     return ", ".join(f"{x + 0.0:.6g}" for x in numbers)  # no -0
 
 
-def _describe_wall(quad: "Quad", texture: "WallTexture") -> None:
-    rows, nv, nu = texture.values.shape[:3]
-    result(f"{quad.name} (wall)")
-    result(f"  corner           {three(quad.corner)}")
-    result(f"  edges            {three(quad.edge_u)}; {three(quad.edge_v)}")
-    glow = f", emission {three(quad.material.emission)}" if quad.material.emission.any() else ""
-    result(f"  albedo           {three(quad.material.albedo)}{glow}")
-    result(f"  light            {nu} x {nv} texels, {rows} isovalues")
+def _describe_wall(about: dict[str, Any], rows: int) -> None:
+    result(f"{about['name']} (wall)")
+    result(f"  corner           {three(about['corner'])}")
+    result(f"  edges            {three(about['edge_u'])}; {three(about['edge_v'])}")
+    glow = f", emission {three(about['emission'])}" if any(about["emission"]) else ""
+    result(f"  albedo           {three(about['albedo'])}{glow}")
+    result(f"  light            {' x '.join(map(str, about['texels']))} texels, {rows} isovalues")
 
 
-def _describe_lattice(name: str, volume: "Volume") -> None:
+def _describe_lattice(
+    name: str, lattice: Any, counts: "Sequence[int]", ends: tuple[float, float], unit: str | None = None
+) -> None:
     from illumgrid.errors import shown_range
 
+    unit = getattr(lattice, "unit", unit)
     result(f"{name}")
-    result(f"  shape            {' x '.join(map(str, volume.shape))} voxels (x, y, z)")
-    result(f"  spacing          {three(volume.spacing)}{f' {volume.unit}' if volume.unit else ''}")
-    result(f"  origin           {three(volume.origin)} (world; for medical formats LPS millimetres)")
-    result(f"  axes             {'; '.join(three(volume.direction[:, axis]) for axis in range(3))}")
-    result(f"  values           {shown_range(volume.extremes, 6)}")
-    result(f"  histogram        |{histogram_line(volume)}| (logarithmic)")
+    result(f"  shape            {' x '.join(map(str, lattice.shape))} voxels (x, y, z)")
+    result(f"  spacing          {three(lattice.spacing)}{f' {unit}' if unit else ''}")
+    result(f"  origin           {three(lattice.origin)} (world; for medical formats LPS millimetres)")
+    result(f"  axes             {'; '.join(three(lattice.direction[:, axis]) for axis in range(3))}")
+    result(f"  values           {shown_range(ends, 6)}")
+    result(f"  histogram        |{histogram_line(counts)}| (logarithmic)")
 
 
 def _describe_run(source: str) -> None:
-    from illumgrid.chain import load
     from illumgrid.errors import shown_range
+    from illumgrid.field.lattice import GridSpec
+    from illumgrid.io import store
 
-    light = load(source)
-    for field, grid in zip(light.scene.fields, light.grids):
-        _describe_lattice(field.name, field.volume)
-        result(f"  range            {shown_range(field.range, 6)}, inside {field.inside}")
-        supported = float((grid.support > 0).mean())
-        result(
-            f"  light            {' x '.join(map(str, grid.spec.shape))} nodes, {supported:.1%} with light of their own"
-        )
-    for quad, texture in zip(light.scene.quads, light.walls):
-        _describe_wall(quad, texture)
-    recipe = light.recipe
+    record = store.describe(source)
+    for about in record["scene"]["fields"]:
+        lattice, grid = GridSpec(*(about[key] for key in ("shape", *store.PLACE))), record["grids"][about["name"]]
+        _describe_lattice(about["name"], lattice, about["histogram"], about["extremes"], about["unit"])
+        result(f"  range            {shown_range(about['range'], 6)}, inside {about['inside']}")
+        nodes = " x ".join(map(str, grid["shape"]))
+        result(f"  light            {nodes} nodes, {grid['lit']:.1%} with light of their own")
+    for quad in record["scene"]["quads"]:
+        _describe_wall(quad, len(record["levels"]))
+    recipe = record["recipe"]
     names = ", ".join(
         f"{kind} {recipe[kind]['name']}" for kind in ("sampler", "backend", "interpolator") if kind in recipe
     )

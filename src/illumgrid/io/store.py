@@ -2,17 +2,17 @@
 
 ``moments.npz``, of a run from the command line, is what more paths go on from: see `illumgrid.io.partial`.
 
-``illumination.exr`` is a multi-part OpenEXR file, float32, scan lines, ZIP. Each field has two parts,
+``illumination.exr`` is a multi-part OpenEXR file (see `illumgrid.io.exr`). Each field has two parts,
 
 - ``light/<field name>``: the channels of its illumination grid (R, G, B; or Y, where it is grey), error and support; of
   several lights also each alone, ``key.Y`` (to be multiplied by the light's colour) or ``key.R``, and ``key.Y.error``;
-- ``field/<field name>``: channel Y, the field's values as they were used;
+- ``field/<field name>``: the field's values as they were used, in their type;
 
 and each quad one, ``wall/<quad name>``: light and support of its texels, (nu, nv, rows of the level table).
 
-A 3D array (nx, ny, nz) is an image nx wide and ny*nz high: row = z*ny + y, column = x. ``run.json`` says where the
-arrays lie in the world, how channels of light mix to RGB, and all else. Its ``checksum`` covers itself and the EXR
-file: the EXR library never sees a damaged file, and a digit that changed is never taken for a result.
+``run.json`` says where the arrays lie in the world, how channels of light mix to RGB, and all else. Its ``checksum``
+covers itself, and in it that of the EXR file: the EXR library never sees a damaged file, and a digit that changed is
+never taken for a result. To describe a run the pixels are not read.
 """
 
 import errno
@@ -22,37 +22,32 @@ import os
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
-from math import prod
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import OpenEXR
-from numpy.typing import NDArray
 
 from illumgrid.errors import BadInput
 from illumgrid.field.lights import Distant, Harmonics, Light, Sky
 from illumgrid.field.scene import Field, Levels, Material, Quad, Scene
-from illumgrid.field.volume import Lattice, Volume
+from illumgrid.field.volume import NATIVE, Lattice, Volume, histogram
 from illumgrid.grid import RGB, Channels, GridSpec, IlluminationGrid, WallTexture
-from illumgrid.io import disk
+from illumgrid.io import disk, exr
 from illumgrid.io.disk import ELSEWHERE
 
-FORMAT = 2  # 1 had RGB only
+FORMAT = 3  # 1 had RGB only; to 2, fields were float32 with x fastest, and one checksum covered both files
 EXR, RUN, PREVIEW, MOMENTS = "illumination.exr", "run.json", "preview.png", "moments.npz"
 PLACE = ("origin", "spacing", "direction")
+BINS = 64  # of the histogram of a field
 EDGES = ("corner", "edge_u", "edge_v")
 KINDS = {
     "Sky": ("name", "radiance"),
     "Distant": ("name", "direction", "angle", "irradiance"),
     "Harmonics": ("name", "coefficients"),
 }
-LAYOUT = "array (nx, ny, nz) = ({}, {}, {}); row = z*ny + y, column = x"
-DEFLATE_AT_MOST = 1032  # bytes out for one byte in: a file that claims more is refused before memory is asked for
 AGAIN = "give a folder that 'illumgrid run' wrote, or run it again"
 
-Image = NDArray[np.float32]
-Plan = dict[str, tuple[tuple[int, int, int], list[str]]]  # by part, in the order of the file: array shape, channels
+Plan = dict[str, exr.Planned]  # by part, in the order of the file
 Record = dict[str, Any]  # the content of run.json
 
 
@@ -130,7 +125,8 @@ def write(folder: str | os.PathLike[str], stored: Stored, picture: bytes | None,
             fresh = work / "new"
             fresh.mkdir()  # with the umask's mode; `work` is closed to others
             _write_exr(fresh / EXR, stored)
-            _read_exr(fresh / EXR, _plan(record))  # the library flushes where it cannot report a full disk: look
+            exr.check_whole(fresh / EXR, _plan(record))
+            record["exr"] = _digest(fresh / EXR)
             record["checksum"] = _checksum(record, fresh / EXR)
             (fresh / RUN).write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
             if picture is not None:
@@ -196,11 +192,32 @@ def read(folder: str | os.PathLike[str]) -> Stored:
         record = _read_record(place / RUN)
         plan = _plan(record)
     with disk.sentences(f"{place / EXR} cannot be used", AGAIN):
-        if record["checksum"] != _checksum(record, place / EXR):
+        known = record["format"] < 3 or record["exr"] == _digest(place / EXR)
+        if not known or record["checksum"] != _checksum(record, place / EXR):
             raise BadInput(f"it, or {RUN} beside it, was damaged or changed since it was written")
-        parts = _read_exr(place / EXR, plan)
+        parts = exr.read(place / EXR, plan)
     with disk.sentences(f"{place / RUN} is not the record of a run", AGAIN):
-        return _rebuild(record, parts)
+        return _rebuild(record, plan, parts)
+
+
+def describe(folder: str | os.PathLike[str]) -> Record:
+    """What ``run.json`` says, its pixels unread: of every field also extremes, histogram and share of lit nodes.
+
+    Raises
+    ------
+    BadInput
+        If the folder holds no run, or its record was damaged. Damage to the pixels is not noticed.
+    """
+    place = Path(folder)
+    if not (place / EXR).is_file() or not (place / RUN).is_file():
+        return _describe(read(folder))  # says what is missing
+    with disk.sentences(f"{place / RUN} is not the record of a run", AGAIN):
+        record = _read_record(place / RUN)
+        if record["format"] < 3:
+            return _describe(read(folder))
+        if record["checksum"] != _checksum(record, place / EXR):
+            raise BadInput("it was damaged or changed since it was written")
+    return record
 
 
 def _describe(stored: Stored) -> Record:
@@ -213,6 +230,8 @@ def _describe(stored: Stored) -> Record:
         {"name": f.name, "range": f.range.tolist(), "inside": f.inside, "falling": f.falling}
         | {"slope": f.volume.slope, "intercept": f.volume.intercept, "unit": f.volume.unit}
         | {"albedo": f.material.albedo.tolist(), "emission": f.material.emission.tolist()}
+        | {"type": f.volume.values.dtype.name, "extremes": f.volume.extremes}
+        | {"histogram": histogram(f.volume, BINS)[0].tolist()}
         | lattice(f.volume)
         for f in stored.scene.fields
     ]
@@ -230,7 +249,10 @@ def _describe(stored: Stored) -> Record:
         "scene": {"fields": fields, "quads": quads, "background": stored.scene.background.tolist()}
         | {"lights": [_described(light) for light in stored.scene.lights]},
         "levels": np.asarray(stored.levels.table, float).tolist(),
-        "grids": {f.name: lattice(grid.spec) for f, grid in zip(stored.scene.fields, stored.grids)},
+        "grids": {
+            f.name: lattice(grid.spec) | {"lit": float((grid.support > 0).mean())}
+            for f, grid in zip(stored.scene.fields, stored.grids)
+        },
         "channels": {part: asdict(channels) for part, channels in lit.items()},
         "recipe": stored.recipe,
     }
@@ -252,9 +274,17 @@ def _light(about: Record) -> Light:
     return light
 
 
+def _digest(file: Path) -> str:
+    with file.open("rb") as opened:
+        return hashlib.file_digest(opened, "sha256").hexdigest()
+
+
 def _checksum(record: Record, exr: Path) -> str:
-    with exr.open("rb") as file:
-        digest = hashlib.file_digest(file, "sha256")
+    """Of the record, which holds the digest of the EXR file; before format 3, of both files together."""
+    digest = hashlib.sha256()
+    if record["format"] < 3:
+        with exr.open("rb") as file:
+            digest = hashlib.file_digest(file, "sha256")
     rest = {key: value for key, value in record.items() if key != "checksum"}
     digest.update(json.dumps(rest, sort_keys=True, allow_nan=False).encode())
     return digest.hexdigest()
@@ -262,14 +292,14 @@ def _checksum(record: Record, exr: Path) -> str:
 
 def _read_record(path: Path) -> Record:
     record: Record = json.loads(path.read_text(encoding="utf-8"))
-    if record["format"] not in (1, FORMAT):
+    if record["format"] not in range(1, FORMAT + 1):
         raise BadInput(f"its format is {record['format']!r}; illumgrid {version('illumgrid')} reads 1 to {FORMAT}")
     if not isinstance(record["recipe"], dict):
         raise BadInput("its recipe is not a table")
     return record
 
 
-def _rebuild(record: Record, parts: dict[str, dict[str, Image]]) -> Stored:
+def _rebuild(record: Record, plan: Plan, parts: exr.Parts) -> Stored:
     grids, fields = [], []
     for about in record["scene"]["fields"]:
         where, part = record["grids"][about["name"]], f"light/{about['name']}"
@@ -278,10 +308,12 @@ def _rebuild(record: Record, parts: dict[str, dict[str, Image]]) -> Stored:
             _channels(record, part),
             parts.pop(part),
         )
-        values, error, support = (_array(light, names, spec.shape) for names in (channels.names, "error", "support"))
-        errors = _array(light, tuple(_errors(channels)), spec.shape) if _errors(channels) else None
+        values, error, support = (exr.array(light, names, spec.shape) for names in (channels.names, "error", "support"))
+        errors = exr.array(light, tuple(_errors(channels)), spec.shape) if _errors(channels) else None
         grids.append(IlluminationGrid(spec, values, error, support, channels, errors))
-        values = _array(parts.pop(f"field/{about['name']}"), "Y", _shape(about))
+        part = f"field/{about['name']}"
+        inside, image = plan[part], parts.pop(part)
+        values = exr.field_values(image, inside) if inside.field else exr.array(image, "Y", inside.shape)
         origin, spacing, direction = (about[k] for k in PLACE)
         slope, intercept = about.get("slope", 1.0), about.get("intercept", 0.0)
         volume = Volume(values, origin, spacing, direction, slope, intercept, about.get("unit"))
@@ -292,7 +324,7 @@ def _rebuild(record: Record, parts: dict[str, dict[str, Image]]) -> Stored:
     for about in record["scene"]["quads"]:
         part, shape = f"wall/{about['name']}", _wall_shape(about, record)
         texels, channels = parts.pop(part), _channels(record, part)
-        values, support = (_array(texels, names, shape).swapaxes(0, 2) for names in (channels.names, "support"))
+        values, support = (exr.array(texels, names, shape).swapaxes(0, 2) for names in (channels.names, "support"))
         walls.append(WallTexture(values, np.ascontiguousarray(support), channels))
         material = Material(about["albedo"], about["emission"])
         corner, edge_u, edge_v = (np.array(about[name], float) for name in EDGES)
@@ -335,71 +367,43 @@ def _plan(record: Record) -> Plan:
     for about in record["scene"]["fields"]:
         part = f"light/{about['name']}"
         channels = _channels(record, part)
-        names = sorted((*channels.names, *_errors(channels), "error", "support"))
-        plan[part] = _shape(record["grids"][about["name"]]), names
-        plan[f"field/{about['name']}"] = _shape(about), ["Y"]
+        names = (*channels.names, *_errors(channels), "error", "support")
+        plan[part] = exr.Planned(_shape(record["grids"][about["name"]]), names)
+        plan[f"field/{about['name']}"] = _planned_field(record, about)
     for about in record["scene"]["quads"]:
         part = f"wall/{about['name']}"
-        plan[part] = _wall_shape(about, record), sorted((*_channels(record, part).names, "support"))
+        plan[part] = exr.Planned(_wall_shape(about, record), (*_channels(record, part).names, "support"))
     return plan
 
 
-def _image(array: Image) -> Image:
-    """Lay out an array (nx, ny, nz) as an image (nz*ny, nx)."""
-    nx, ny, nz = array.shape
-    return np.ascontiguousarray(array.swapaxes(0, 2)).reshape(nz * ny, nx)
-
-
-def _array(part: dict[str, Image], names: str | tuple[str, ...], shape: tuple[int, int, int]) -> Image:
-    """Undo `_image`: one channel as (nx, ny, nz), without a copy; several as (nx, ny, nz, C)."""
-    if isinstance(names, str):
-        return part[names].reshape(shape[::-1]).swapaxes(0, 2)
-    return np.stack([_array(part, name, shape) for name in names], axis=-1)
+def _planned_field(record: Record, about: Record) -> exr.Planned:
+    if record["format"] < 3:
+        return exr.Planned(_shape(about), ("Y",))
+    if about["type"] not in [kind.name for kind in NATIVE]:
+        raise BadInput(f"the values of {about['name']!r} are {str(about['type'])[:40]!r}; expected {NATIVE}")
+    return exr.Planned(_shape(about), ("Y" if about["type"] == "float32" else exr.BYTES,), about["type"], field=True)
 
 
 def _write_exr(path: Path, stored: Stored) -> None:
-    def split(of: IlluminationGrid | WallTexture) -> dict[str, Image]:
+    def split(of: IlluminationGrid | WallTexture) -> dict[str, Any]:
         return {name: of.light[..., c] for c, name in enumerate(of.channels.names)}
 
-    arrays: dict[str, dict[str, Image]] = {}
+    def images(arrays: dict[str, Any]) -> tuple[exr.Planned, dict[str, exr.Image]]:
+        shape = next(iter(arrays.values())).shape
+        return exr.Planned(shape, tuple(arrays)), {name: exr.image(array) for name, array in arrays.items()}
+
+    parts: dict[str, tuple[exr.Planned, dict[str, exr.Image]]] = {}
     for f, grid in zip(stored.scene.fields, stored.grids):
-        arrays[f"light/{f.name}"] = split(grid) | {"error": grid.error, "support": grid.support}
+        arrays = split(grid) | {"error": grid.error, "support": grid.support}
         if names := _errors(grid.channels):
             errors = np.full(grid.light.shape, np.inf, np.float32) if grid.errors is None else grid.errors
-            arrays[f"light/{f.name}"] |= {name: errors[..., c] for c, name in enumerate(names)}
-        arrays[f"field/{f.name}"] = {"Y": f.volume.values}
+            arrays |= {name: errors[..., c] for c, name in enumerate(names)}
+        parts[f"light/{f.name}"] = images(arrays)
+        parts[f"field/{f.name}"] = exr.of_field(f.volume.values)
     for quad, wall in zip(stored.scene.quads, stored.walls):
         turned = split(wall) | {"support": wall.support}
-        arrays[f"wall/{quad.name}"] = {channel: array.swapaxes(0, 2) for channel, array in turned.items()}
-    shapes = [next(iter(channels.values())).shape for channels in arrays.values()]
-    window = ((0, 0), (max(s[0] for s in shapes) - 1, max(s[1] * s[2] for s in shapes) - 1))  # all parts must share it
-    common = {"type": OpenEXR.scanlineimage, "compression": OpenEXR.ZIP_COMPRESSION, "displayWindow": window}
-    parts = [
-        OpenEXR.Part(common | {"layout": LAYOUT.format(*shape)}, {c: _image(a) for c, a in channels.items()}, name)
-        for (name, channels), shape in zip(arrays.items(), shapes)
-    ]
-    OpenEXR.File(parts).write(os.fsencode(path))
-
-
-def _read_exr(path: Path, plan: Plan) -> dict[str, dict[str, Image]]:
-    """Images of every part by channel, if the headers agree with the plan."""
-    size = path.stat().st_size
-    if sum(4 * prod(shape) * len(channels) for shape, channels in plan.values()) > DEFLATE_AT_MOST * size:
-        raise BadInput(f"its {size} bytes cannot hold the arrays that {RUN} describes")
-    kind = OpenEXR.scanlineimage, OpenEXR.ZIP_COMPRESSION
-    expected = [(name, *kind, [[0, 0], [x - 1, z * y - 1]], c) for name, ((x, y, z), c) in plan.items()]
-    for pixels in (False, True):
-        file = OpenEXR.File(os.fsencode(path), separate_channels=True, header_only=not pixels)
-        found = []  # the library leaves out a part whose pixels it cannot read; before 3.4.12, all without pixels
-        for h in (part.header for part in file.parts):
-            window = [np.asarray(corner).tolist() for corner in h["dataWindow"]]
-            found.append((h["name"], h["type"], h["compression"], window, sorted(c.name for c in h["channels"])))
-        if found != expected and (pixels or found):
-            raise BadInput(f"its parts are not those that {RUN} describes, or cannot be read")
-    images = {part.name(): {c: image.pixels for c, image in part.channels.items()} for part in file.parts}
-    if any(image.dtype != np.float32 for part in images.values() for image in part.values()):
-        raise BadInput("its pixels are not float32")
-    return images
+        parts[f"wall/{quad.name}"] = images({channel: array.swapaxes(0, 2) for channel, array in turned.items()})
+    exr.write(path, parts)
 
 
 def is_run(folder: str | os.PathLike[str]) -> bool:

@@ -134,7 +134,7 @@ def write_exr(path: Path, points: Points, progress: "Progress") -> None:
     """Write an image nx wide and ny·nz high, float32: R, G, B (irradiance), error, support, field."""
     import OpenEXR
 
-    from illumgrid.io.store import LAYOUT
+    from illumgrid.io.exr import LAYOUT
 
     if points.arrays["field"].dtype == np.float64:
         raise BadInput("the field's values need double precision, which .exr lacks; expected .vti, .nrrd or .npz")
