@@ -16,9 +16,11 @@ from illumgrid.errors import BadInput, shown, shown_range
 if TYPE_CHECKING:
     from illumgrid.light import Illumination
     from illumgrid.show import Camera
+    from illumgrid.show.exact import Exact
 
 SIZE = 960, 720
 MOST_PANELS = 32
+FULL_PATHS = 256
 
 CONFLICTS = {
     "--sweep": {"--isovalue": "a sweep shows the whole range", "--isovalues": "a sweep shows the whole range"},
@@ -33,6 +35,12 @@ CONFLICTS = {
     "--trust": {"--local": "error bars are those of global light", "--split": "error bars are those of global light",
                 "--exposure": "error bars are not light"},
     "--split": {"--local": "--split shows local light on the left"},
+    "--exact": {
+        "--local": "a lamp at the camera needs no rays", "--trust": "error bars are those of lookups",
+        "--grid-volume": "the grid is what it is", "--engine": "rays are traced in software",
+    },
+    "--watch": {"--sweep": "a film is written once", "--isovalues": "a strip is written once",
+                "--split": "two pictures are written once"},
     "--camera": dict.fromkeys(("--view", "--zoom", "--up", "--roll"), "the camera of the picture says all of that"),
 }  # fmt: skip
 """Options that exclude each other, and the reason."""
@@ -71,6 +79,18 @@ def preview(
     ] = False,
     cut: Annotated[
         bool, typer.Option("--cut", help="With --grid-volume: cut out the corner nearest to the eye.")
+    ] = False,
+    exact: Annotated[
+        str | None,
+        typer.Option(
+            metavar="N|full[:N]",
+            help="Gather light by N rays from every pixel, each ending in the grid at its first hit: sharp shadows. "
+            "full: paths of every length and no grid, the reference, 256 of them by default.",
+        ),
+    ] = None,
+    watch: Annotated[
+        bool,
+        typer.Option("--watch", help="With --exact: write the picture after 4 rays, after 16, 64... too."),
     ] = False,
     view: Annotated[
         str | None,
@@ -111,11 +131,13 @@ def preview(
         "--sweep": sweep is not None, "--isovalue": isovalue is not None, "--isovalues": isovalues is not None,
         "--local": local, "--trust": trust, "--split": split, "--grid-volume": grid_volume, "--scale-bar": scale_bar,
         "--exposure": exposure != 0, "--view": view is not None, "--zoom": zoom != 1, "--up": up is not None,
-        "--roll": roll != 0, "--camera": camera is not None,
+        "--roll": roll != 0, "--camera": camera is not None, "--exact": exact is not None, "--watch": watch,
+        "--engine": engine not in ("auto", "software"),
     }  # fmt: skip
     _check(given, output, sweep, isovalue, cut, background)
     several = None if isovalues is None else _numbers(isovalues)
-    engine_used, why = show.choose_engine(engine)
+    engine_used, why = show.choose_engine(engine if exact is None else "software")
+    gathered = None if exact is None else _exact(exact)
     light = relit(load(folder), weights, sky, turn)
     options: dict[str, Any] = {"background": background, "engine": engine_used, "stops": exposure}
     if size != SIZE:
@@ -129,19 +151,27 @@ def preview(
         _note_outside(light, field, asked)
         seen_by = seen_by or _fitted(light, field, asked, sweep is not None, options, look)
         options |= {"trust": trust, "bar": scale_bar, "camera": seen_by}
+        if gathered is not None:
+            options |= {"exact": gathered}
+            if watch:
+                options |= {"watch": lambda picture: _write(output, picture, seen_by)}
         if sweep is not None:
             _film(light, field, sweep, _drawn(light, field, local, split, options), seen_by)
-        elif several:
-            _write(output, show.strip(light, several, field, local=local, **options), seen_by)
         else:
             if trust and camera is None:  # the scale below leaves the picture another aspect
                 options |= look | {"camera": None}
-            _write(output, _drawn(light, field, local, split, options)(isovalue), seen_by)
+            with progress_bars() as progress:
+                options |= {"progress": progress}
+                if several:
+                    picture = show.strip(light, several, field, local=local, **options)
+                else:
+                    picture = _drawn(light, field, local, split, options)(isovalue)
+            _write(output, picture, seen_by)
     if trust:
         _say_doubts(light)
     wrote = f"wrote {output}" if sweep is None else f"wrote {sweep[1]}, {sweep[0]} isovalues"
     say(wrote + ("" if local or trust else f" at exposure {light.exposure * 2**exposure:.4g}"))
-    if engine == "auto":
+    if engine == "auto" and exact is None:
         say(f"drawn by the engine {engine_used}: {why}")
 
 
@@ -161,6 +191,8 @@ def _check(
         for other, why in others.items():
             if given[one] and given[other]:
                 raise BadInput(f"{other} came with {one}; expected one of the two: {why}")
+    if given["--watch"] and not given["--exact"]:
+        raise BadInput("--watch came without --exact; expected both, or neither")
     if cut and not given["--grid-volume"]:
         raise BadInput("--cut came without --grid-volume; expected both, or neither")
     if sweep is not None:
@@ -175,6 +207,16 @@ def _check(
             raise BadInput(
                 "--background is transparent; expected a colour for a film, or a folder of PNG to sweep into"
             )
+
+
+def _exact(text: str) -> "Exact":
+    """What --exact says: a number of rays, or `full` paths and perhaps their number."""
+    from illumgrid.show.exact import Exact
+
+    first, _, number = text.rpartition(":") if text != "full" else ("full", "", str(FULL_PATHS))
+    if first not in ("", "full") or not (number.isascii() and number.isdigit() and len(number) < 9):
+        raise BadInput(f"--exact is {text[:60]!r}; expected a number of rays a pixel, full, or full:256")
+    return Exact(int(number), first == "full")
 
 
 def _numbers(text: str) -> list[float]:

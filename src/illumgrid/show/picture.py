@@ -1,13 +1,14 @@
 """Pictures: an isosurface lit by a lookup, a strip of several, and the illumination grid as a block."""
 
 import io
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from illumgrid.bake import Progress
 from illumgrid.errors import BadInput
 from illumgrid.field.upright import axes_of, up_of
 from illumgrid.field.volume import box_corners
@@ -17,6 +18,7 @@ from illumgrid.show.block import Block
 from illumgrid.show.camera import Camera, View, camera_around, fit_camera, outline_of
 from illumgrid.show.captions import isovalues_of, labelled, scale_bar
 from illumgrid.show.engines import choose_engine, gl, software
+from illumgrid.show.exact import Exact, Gathering
 from illumgrid.show.shade import BACKGROUND, Colors, Shown, opaque
 from illumgrid.show.trust import scale
 from illumgrid.tone import decode_srgb, encode_srgb
@@ -73,6 +75,9 @@ def render(
     bar: bool = False,
     engine: str = "software",
     camera: Camera | None = None,
+    exact: Exact | None = None,
+    watch: Callable[[Picture], None] | None = None,
+    progress: Progress = lambda what, done, total: None,
 ) -> Picture:
     """Picture (height, width, 3), sRGB, of one setting of the sweep; (height, width, 4) on a transparent background.
 
@@ -109,6 +114,12 @@ def render(
         What draws: see `choose_engine`.
     camera : Camera, optional
         In place of `view`, `zoom`, `up` and `roll`.
+    exact : Exact, optional
+        Gather light by rays from every pixel, drawn in software: see `illumgrid.show.exact`. Not with `local`, `trust`.
+    watch : callable, optional
+        Called with each exact picture on the way, of four times as many rays as the one before, and with the last.
+    progress : callable, optional
+        Called with (what, done, total) while light is gathered.
 
     Raises
     ------
@@ -123,11 +134,19 @@ def render(
     rows = height - sum(map(len, strips))
     if camera is None:
         camera = fit_camera(light.scene, shown.row, width / rows, view, zoom, up=up, roll=roll)
-    picture = sheet.finished(_drawn(shown, camera, sheet, rows))
-    if bar:
-        outline = outline_of(light.scene, shown.row)
-        middle = (outline.min(axis=0) + outline.max(axis=0)) / 2
-        picture = scale_bar(picture, camera, middle, light.scene.fields[0].volume)
+    if exact is None or local or trust:
+        drawn = iter([_drawn(shown, camera, sheet, rows)])
+    else:
+        made = Gathering(shown, camera, width, height, exact)
+        drawn = made.pictures(sheet.background, watch is not None, progress)
+    for one in drawn:
+        picture = sheet.finished(one)
+        if bar:
+            outline = outline_of(light.scene, shown.row)
+            middle = (outline.min(axis=0) + outline.max(axis=0)) / 2
+            picture = scale_bar(picture, camera, middle, light.scene.fields[0].volume)
+        if watch is not None:
+            watch(picture)
     if strips and picture.shape[2] == 4:
         strips = [np.concatenate([s, np.full((*s.shape[:2], 1), 255, np.uint8)], axis=2) for s in strips]
     return np.concatenate([picture, *strips])

@@ -61,28 +61,33 @@ class Shown:
         """Factor on albedo/π · E."""
         return self.light.exposure * float(2.0**self.stops)
 
-    def field(self, number: int, points: Floats, facing: Floats) -> Colors:
-        """Colours (n, 3) of the level set of a field at world points (n, 3) that face the eye by this cosine (n,)."""
+    def field(self, number: int, points: Floats, facing: Floats, light: Colors | None = None) -> Colors:
+        """Colours (n, 3) of the level set of a field at world points (n, 3) that face the eye by this cosine (n,).
+
+        Irradiance `light` (n, 3), if any, takes the place of a lookup.
+        """
         if self.trust:
             return trust_colors(self.light.grids[number], points, facing)
         albedo = self.scene.fields[number].material.albedo
         if self.local:
             return self._lamplit(albedo / albedo.max(initial=1e-9), facing)
-        return curve(self.light.grids[number].lookup(points) * (albedo / np.pi * self.exposure).astype(np.float32))
+        light = self.light.grids[number].lookup(points) if light is None else light
+        return curve(light * (albedo / np.pi * self.exposure).astype(np.float32))
 
     def cap(self, number: int) -> Colors:
         """Colour (3,) of the cuts through the solid of a field."""
         albedo = np.full(3, 0.5) if self.trust else self.scene.fields[number].material.albedo
         return (CAP_TONE * albedo).astype(np.float32)
 
-    def wall(self, number: int, u: Floats, v: Floats, facing: Floats) -> Colors:
-        """Colours (n, 3) of the front of a quad at shares u, v (n,) of its edges."""
+    def wall(self, number: int, u: Floats, v: Floats, facing: Floats, light: Colors | None = None) -> Colors:
+        """Colours (n, 3) of the front of a quad at shares u, v (n,) of its edges; `light` as for `field`."""
         material = self.scene.quads[number].material
         if self.trust:  # walls have no error bar: no colour that could be taken for one
             return _facing(np.full(3, 0.5 * CAP_TONE), facing)
         if self.local:
             return self._lamplit(np.maximum(material.albedo, material.emission.clip(0, 1)), facing)
-        shown = material.albedo / np.pi * self.light.walls[number].lookup(u, v, self.share) + material.emission
+        light = self.light.walls[number].lookup(u, v, self.share) if light is None else light
+        shown = material.albedo / np.pi * light + material.emission
         return curve((shown * self.exposure).astype(np.float32))
 
     def fade(self, number: int, u: Floats, v: Floats) -> Colors:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,12 +18,17 @@ SIDE = 2  # sub-samples along each side of a pixel
 _ROWS = 24  # picture rows that are traced together: bounds the memory
 
 
-def _directions(camera: Camera, width: int, rows: range, height: int) -> Floats:
+def directions_of(camera: Camera, width: int, rows: range, height: int) -> Floats:
     """Unit directions (n, 3) in the world of the sub-samples of some picture rows, row by row, left to right."""
     x = (2 * (np.arange(width * SIDE) + 0.5) / (width * SIDE) - 1) * camera.tangent * width / height
     y = (1 - 2 * (np.arange(rows.start * SIDE, rows.stop * SIDE) + 0.5) / (height * SIDE)) * camera.tangent
     world = (camera.forward + x[None, :, None] * camera.right + y[:, None, None] * camera.up).reshape(-1, 3)
     return np.asarray(world / np.linalg.norm(world, axis=1, keepdims=True))
+
+
+def averaged(color: Colors, width: int) -> NDArray[np.uint8]:
+    """Rows of a picture (rows, width, 4), sRGB and coverage, from the colours (n, 4) of their sub-samples."""
+    return encode_rgba(np.clip(color, 0.0, 1.0).reshape(-1, SIDE, width, SIDE, 4).mean(axis=(1, 3)))
 
 
 def traced(seen: Callable[[Floats], Colors], camera: Camera, width: int, height: int) -> NDArray[np.uint8]:
@@ -31,37 +37,82 @@ def traced(seen: Callable[[Floats], Colors], camera: Camera, width: int, height:
 
     def strip(first: int) -> NDArray[np.uint8]:
         rows = range(first, min(first + _ROWS, height))
-        color = np.clip(seen(_directions(camera, width, rows, height)), 0.0, 1.0)
-        return encode_rgba(color.reshape(len(rows), SIDE, width, SIDE, 4).mean(axis=(1, 3)))
+        return averaged(seen(directions_of(camera, width, rows, height)), width)
 
     with ThreadPoolExecutor(cores()) as pool:
         return np.concatenate(list(pool.map(strip, range(0, height, _ROWS))))
 
 
+@dataclass(frozen=True, eq=False)
+class Hits:
+    """What rays from the eye meet first.
+
+    Parameters
+    ----------
+    point : (n, 3) float64
+        In the world.
+    normal : (n, 3) float64
+        In the world, towards the side that is seen; 0 where nothing is met.
+    facing : (n,) float64
+        Cosine between the normal and the direction to the eye.
+    number : (n,) int64
+        Of the surface: fields count from 0, quads follow; -1 for none.
+    what : (n,) int64
+        `illumgrid.constants.SURFACE`, CAP, QUAD or MISS.
+    """
+
+    point: Floats
+    normal: Floats
+    facing: Floats
+    number: NDArray[np.int64]
+    what: NDArray[np.int64]
+
+    def lit(self, number: int) -> NDArray[np.int64]:
+        """Rows of the rays that meet a surface with light of its own: no cap."""
+        return np.flatnonzero((self.number == number) & (self.what != CAP))
+
+
+def first_hits(shown: Shown, eye: Floats, directions: Floats) -> Hits:
+    """First hits along directions (n, 3) from the eye, all in the world, under one setting of the sweep."""
+    from illumgrid.backends.kernels import cast_rays
+
+    scene, axes, n = shown.scene, shown.scene.fields[0].volume.direction, len(directions)
+    t, number, what, normal = np.zeros(n), np.zeros(n, np.int64), np.zeros(n, np.int64), np.zeros((n, 3))
+    origin, direction = np.tile(scene.to_frame(eye), (n, 1)), directions @ axes
+    cast_rays(shown.light.marchable, turned_levels(scene, shown.row), origin, direction, -1, t, number, what, normal)
+    met = number >= 0
+    point = eye + np.where(met, t, 0.0)[:, None] * directions
+    return Hits(point, normal @ axes.T, -np.einsum("ij,ij->i", normal, direction), number, what)
+
+
+def place_on(shown: Shown, quad: int, points: Floats) -> tuple[Floats, Floats]:
+    """Shares u and v (n,) of the edges of a quad at world points (n, 3) on it."""
+    fields = shown.light.marchable
+    u, v = ((shown.scene.to_frame(points) - fields.quad_corner[quad]) @ fields.quad_duals[quad].T).T
+    return u, v
+
+
+def colors_of(shown: Shown, hits: Hits, background: Colors, light: Colors | None = None) -> Colors:
+    """Colours (n, 4) of what is met, lit by lookups, or by irradiance `light` (n, 3)."""
+    color = np.tile(background, (len(hits.what), 1))
+    for k in range(len(shown.scene.fields)):
+        color[(hits.number == k) & (hits.what == CAP)] = opaque(shown.cap(k))
+        lit = np.flatnonzero((hits.number == k) & (hits.what == SURFACE))
+        own = None if light is None else light[lit]
+        color[lit] = opaque(shown.field(k, hits.point[lit], hits.facing[lit], own))
+    for k in range(len(shown.scene.quads)):
+        lit = np.flatnonzero(hits.number == len(shown.scene.fields) + k)
+        u, v = place_on(shown, k, hits.point[lit])
+        share = shown.fade(k, u, v)[:, None]
+        own = None if light is None else light[lit]
+        color[lit] = share * opaque(shown.wall(k, u, v, hits.facing[lit], own)) + (1 - share) * background
+    return color
+
+
 def draw(shown: Shown, camera: Camera, width: int, height: int, background: Colors) -> NDArray[np.uint8]:
     """Picture (height, width, 4), sRGB and coverage, of one setting of the sweep."""
-    fields, eye = shown.light.marchable, shown.scene.to_frame(camera.eye)
-    axes = shown.scene.fields[0].volume.direction
 
     def seen(directions: Floats) -> Colors:
-        from illumgrid.backends.kernels import cast_rays
-
-        direction, n = directions @ axes, len(directions)
-        origin = np.tile(eye, (n, 1))
-        t, number, what, normal = np.zeros(n), np.zeros(n, np.int64), np.zeros(n, np.int64), np.zeros((n, 3))
-        cast_rays(fields, turned_levels(shown.scene, shown.row), origin, direction, -1, t, number, what, normal)
-        facing = -np.einsum("ij,ij->i", normal, direction)
-        color = np.tile(background, (n, 1))
-        for k in range(len(shown.scene.fields)):
-            color[(number == k) & (what == CAP)] = opaque(shown.cap(k))
-            lit = np.flatnonzero((number == k) & (what == SURFACE))
-            color[lit] = opaque(shown.field(k, camera.eye + t[lit, None] * directions[lit], facing[lit]))
-        for k in range(len(shown.scene.quads)):
-            lit = np.flatnonzero(number == len(shown.scene.fields) + k)
-            place = (eye + t[lit, None] * direction[lit] - fields.quad_corner[k]) @ fields.quad_duals[k].T
-            u, v = place.T
-            share = shown.fade(k, u, v)[:, None]
-            color[lit] = share * opaque(shown.wall(k, u, v, facing[lit])) + (1 - share) * background
-        return color
+        return colors_of(shown, first_hits(shown, camera.eye, directions), background)
 
     return traced(seen, camera, width, height)

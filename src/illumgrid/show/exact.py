@@ -1,0 +1,260 @@
+"""Exact pictures: rays from what a pixel shows gather light, and blend with the lookup by what is known of each.
+
+A gathered ray ends at its first hit, in the light that grids and walls hold there: what they are off enters through one
+reflection only, averaged over the hemisphere, and shadows are as sharp as the pixels. See `illumgrid.grid.cache`.
+"""
+
+from collections.abc import Callable, Iterator
+from concurrent.futures import Executor, ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import cached_property, partial
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from illumgrid.bake import Progress, enough_bounces, shifted_seed
+from illumgrid.errors import BadInput
+from illumgrid.field.volume import Floats
+from illumgrid.light import Illumination
+from illumgrid.show.camera import Camera
+from illumgrid.show.engines import software
+from illumgrid.show.engines.software import SIDE, Hits
+from illumgrid.show.shade import Colors, Shown
+from illumgrid.transport.samples import Queries
+
+MOST_PATHS = 1 << 20
+MOST_PIXELS = 1 << 24
+FEWEST_TRUST, MOST_TRUST = 4.0, 4096.0
+"""Bounds on the number of gathered paths that a lookup is worth."""
+
+_PILOT_RAYS, _PILOT_PATHS, _PILOT_LEAST = 4096, 16, 64
+_LEAST_SHAPE = 0.1  # of a lookup's variance over the usual one: grids do not know of all that they miss
+_BAND = 1 << 17  # sub-samples that are traced together: bounds the memory
+
+
+@dataclass(frozen=True)
+class Exact:
+    """How a picture is lit beyond lookups.
+
+    Parameters
+    ----------
+    paths : int
+        Rays from each pixel.
+    full : bool
+        Paths go on to their ends, and no lookup enters: the reference, slow.
+    """
+
+    paths: int
+    full: bool = False
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.paths <= MOST_PATHS:
+            raise BadInput(f"{self.paths} paths a pixel were asked for; expected 1 to {MOST_PATHS}")
+
+
+def tracer_of(light: Illumination, full: bool) -> tuple["Callable[..., tuple[Colors, NDArray[np.int32]]]", int]:
+    """What answers queries, with irradiance (n, 3) in the mix of the light and the paths walked (n,), and its bounces.
+
+    It is kept with the light, for further pictures.
+    """
+    from illumgrid.backends.numba_ import Numba
+    from illumgrid.grid.cache import cache_of
+    from illumgrid.transport.tracer import prepare
+
+    key = "_followed" if full else "_gathered"
+    if key not in light.__dict__:
+        if full:
+            tracer = prepare(Numba(), light.scene)
+            bounces = 2 * enough_bounces(light.scene, tracer)[0]  # of what was left out a square is left out
+        else:
+            tracer = prepare(Numba(), light.scene, cache_of(light.scene, light.grids, light.walls))
+            bounces = int(light.recipe.get("bounces", 8)) + 1
+        light.__dict__[key] = tracer, bounces
+    tracer, bounces = light.__dict__[key]
+
+    def solve(queries: Queries, paths: range, seed: int) -> tuple[Colors, NDArray[np.int32]]:
+        answer = tracer.solve(queries, paths=paths, bounces=bounces, seed=seed)
+        same = answer.channels.names == light.grids[0].channels.names
+        return (light.grids[0].channels if same else answer.channels).rgb(answer.light), answer.paths
+
+    return solve, bounces
+
+
+def looked_up(shown: Shown, hits: Hits) -> tuple[Colors, Floats]:
+    """Irradiance (n, 3) that lookups find where rays hit, and its variance (n,) as grids know it, 1 on walls."""
+    light, variance = np.zeros((len(hits.what), 3), np.float32), np.ones(len(hits.what))
+    for k, grid in enumerate(shown.light.grids):
+        lit = hits.lit(k)
+        light[lit] = grid.lookup(hits.point[lit])
+        variance[lit] = np.square(grid.uncertainty(hits.point[lit]), dtype=float)
+    for k, wall in enumerate(shown.light.walls):
+        lit = hits.lit(len(shown.light.grids) + k)
+        light[lit] = wall.lookup(*software.place_on(shown, k, hits.point[lit]), shown.share)
+    return light, variance
+
+
+@dataclass(frozen=True, eq=False)
+class Gathering:
+    """Light gathered for the pixels of one picture.
+
+    Parameters
+    ----------
+    shown : Shown
+    camera : Camera
+    width, height : int
+    exact : Exact
+    """
+
+    shown: Shown
+    camera: Camera
+    width: int
+    height: int
+    exact: Exact
+
+    def __post_init__(self) -> None:
+        if self.width * self.height > MOST_PIXELS:
+            raise BadInput(
+                f"an exact picture of {self.width} x {self.height} pixels was asked for; expected at most "
+                f"{MOST_PIXELS / 1e6:.0f} million"
+            )
+
+    @property
+    def surfaces(self) -> int:
+        """Number of fields and quads."""
+        return len(self.shown.scene.fields) + len(self.shown.scene.quads)
+
+    @cached_property
+    def seed(self) -> int:
+        """Of paths that have nothing in common with those of the grids."""
+        return shifted_seed(int(self.shown.light.recipe.get("seed", 0)), 2**61)
+
+    def asked(self, hits: Hits, rows: NDArray[np.int64], ids: NDArray[np.uint64]) -> Queries:
+        """Queries with these ids (m,) at some of the hits."""
+        level = np.tile(self.shown.row, (len(rows), 1))
+        return Queries(ids, hits.point[rows], hits.normal[rows], level, hits.number[rows].astype(np.int32))
+
+    @cached_property
+    def trust(self) -> Floats:
+        """Variance of a ray and of a lookup, and that which grids know of, in the mean over each surface: (F + Q, 3).
+
+        From rays of their own at points spread over the picture. Weights that depended on the rays they weigh would
+        darken it: a pixel that no ray found bright would count as known. Two independent answers G and G' for the
+        lookup L tell both apart: the mean of (G - G')² is twice the variance of each, that of (L - G)(L - G') the
+        variance of L, whatever its cause.
+        """
+        solve, _ = tracer_of(self.shown.light, False)
+        random = np.random.default_rng(self.seed)
+        across, down = random.random((2, _PILOT_RAYS)) * 2 - 1
+        camera, aspect = self.camera, self.width / self.height
+        ahead = camera.forward + camera.tangent * (across[:, None] * aspect * camera.right + down[:, None] * camera.up)
+        hits = software.first_hits(self.shown, camera.eye, ahead / np.linalg.norm(ahead, axis=1, keepdims=True))
+        light, known = looked_up(self.shown, hits)
+        rows = np.concatenate([np.zeros(0, np.int64), *(hits.lit(k) for k in range(self.surfaces))])
+        ids = np.arange(len(rows), dtype=np.uint64)
+        answers = [
+            solve(self.asked(hits, rows, ids), range(_PILOT_PATHS), shifted_seed(self.seed, k + 1)) for k in range(2)
+        ]
+        good = (answers[0][1] > 0) & np.isfinite(known[rows])
+        (one, _), (other, _) = answers
+        of_ray = _PILOT_PATHS * 0.5 * np.square(one - other, dtype=float).mean(axis=1)
+        of_lookup = ((light[rows] - one).astype(float) * (light[rows] - other)).mean(axis=1)
+
+        def found(chosen: NDArray[np.bool_]) -> Floats:
+            chosen = chosen & good
+            if not chosen.any():
+                return np.array([1.0, 0.0, 1.0])
+            return np.array([of_ray[chosen].mean(), max(of_lookup[chosen].mean(), 0.0), known[rows][chosen].mean()])
+
+        each = [hits.number[rows] == k for k in range(self.surfaces)]
+        whole = np.ones(len(rows), bool)
+        return np.array([found(own if (own & good).sum() >= _PILOT_LEAST else whole) for own in each])
+
+    def worth_of_lookup(self, hits: Hits, known: Floats) -> Floats:
+        """How many gathered rays (n,) each lookup is worth, from what its grid knows of its variance (n,).
+
+        What the grid knows says where lookups are good; how good they are in all, the trial rays say.
+        """
+        ray, lookup, usual = self.trust[np.maximum(hits.number, 0)].T
+        shape = np.divide(known, usual, out=np.ones(len(known)), where=usual > 0)
+        variance = lookup * np.maximum(shape, _LEAST_SHAPE)
+        worth = np.divide(ray, variance, out=np.full(len(known), np.inf), where=variance > 0)
+        return np.asarray(np.clip(worth, FEWEST_TRUST, MOST_TRUST))
+
+    def blended(self, hits: Hits, pixel: NDArray[np.int64], total: Colors, count: NDArray[np.int32]) -> Colors:
+        """Irradiance (n, 3) at sub-samples that belong to these pixels (n,), from sums (n, 3) over so many rays (n,).
+
+        Rays of the sub-samples of a pixel on one surface count together; each keeps what its lookup differs by.
+        """
+        light, known = looked_up(self.shown, hits)
+        group = pixel * self.surfaces + np.maximum(hits.number, 0)
+
+        def summed(values: NDArray[np.floating]) -> Floats:
+            return np.bincount(group, values).astype(float)
+
+        rays, members = summed(count.astype(float))[group], np.bincount(group)[group]
+        worth = np.zeros(len(group)) if self.exact.full else self.worth_of_lookup(hits, known)
+        share = np.divide(rays, rays + summed(worth)[group] / members, out=np.zeros(len(group)), where=rays > 0)
+        for color in range(3):
+            gathered = summed(total[:, color])[group] / np.maximum(rays, 1.0)
+            before = light[:, color] if self.exact.full else summed(light[:, color])[group] / members
+            light[:, color] = np.maximum(light[:, color] + share * (gathered - before), 0.0)
+        return light
+
+    def pictures(
+        self, background: Colors, refined: bool = False, progress: Progress = lambda what, done, total: None
+    ) -> Iterator[NDArray[np.uint8]]:
+        """Pictures (height, width, 4), sRGB and coverage: the last one, or if `refined` each of `steps_to` it."""
+        from illumgrid.backends.numba_ import cores
+
+        steps = list(pairwise([0, *steps_to(self.exact.paths)]))
+        total = np.zeros((self.height * self.width * SIDE**2, 3), np.float32)
+        count = np.zeros(len(total), np.int32)
+        per_row = self.width * SIDE**2
+        rows = max(1, _BAND // per_row)
+        with ThreadPoolExecutor(cores()) as pool:
+            for some in [[step] for step in steps] if refined else [steps]:
+                strips = []
+                for first in range(0, self.height, rows):
+                    band = range(first, min(first + rows, self.height))
+                    part = slice(band.start * per_row, band.stop * per_row)
+                    hits = self._hits(pool, band)
+                    pixel = self._gather(hits, band.start, some, total[part], count[part])
+                    light = self.blended(hits, pixel, total[part], count[part])
+                    color = software.colors_of(self.shown, hits, background, light)
+                    strips.append(software.averaged(color, self.width))
+                    progress(f"{some[-1][1]} rays a pixel", band.stop, self.height)
+                yield np.concatenate(strips)
+
+    def _gather(
+        self, hits: Hits, first: int, steps: list[tuple[int, int]], total: Colors, count: NDArray[np.int32]
+    ) -> NDArray[np.int64]:
+        """Add light and number of these paths to those of sub-samples (n,) from picture row `first` on.
+
+        The four sub-samples of a pixel share the paths of one sequence, a quarter of each step for each; returns the
+        pixels that they belong to, counted from that row.
+        """
+        solve, _ = tracer_of(self.shown.light, self.exact.full)
+        y, x = np.divmod(np.arange(len(hits.what)), self.width * SIDE)
+        pixel, place = y // SIDE * self.width + x // SIDE, y % SIDE * SIDE + x % SIDE
+        lit = np.concatenate([hits.lit(k) for k in range(self.surfaces)])
+        for number in range(SIDE**2):
+            mine = lit[place[lit] == number]
+            asked = self.asked(hits, mine, (pixel[mine] + first * self.width).astype(np.uint64))
+            for low, high in steps:
+                start, stop = (low + (high - low) * k // SIDE**2 for k in (number, number + 1))
+                if start < stop:
+                    found, walked = solve(asked, range(start, stop), self.seed)
+                    total[mine] += found * walked[:, None]
+                    count[mine] += walked
+        return np.asarray(pixel)
+
+    def _hits(self, pool: Executor, band: range) -> Hits:
+        directions = software.directions_of(self.camera, self.width, band, self.height)
+        parts = pool.map(partial(software.first_hits, self.shown, self.camera.eye), np.array_split(directions, 8))
+        return Hits(*(np.concatenate(arrays) for arrays in zip(*(vars(part).values() for part in parts))))
+
+
+def steps_to(paths: int) -> list[int]:
+    """Numbers of rays from each pixel at which a picture can be shown: 4, 16, 64, ... and the last."""
+    return [*(4**k for k in range(1, 11) if 4**k < paths), paths]
