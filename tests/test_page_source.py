@@ -30,13 +30,13 @@ LIGHT = coloured(pair())
 # The source
 
 
-def test_the_source_is_under_60_kb():
+def test_the_source_is_under_68_kb():  # 6 kB of them turn a sky of up to 25 functions
     text = page(LIGHT)
     carried = re.findall(
         r'<script type="(?:application/json" id="scene|text/plain" id="data)">(.*?)</script>', text, re.S
     )
     assert len(carried) == 2
-    assert len(text.encode()) - sum(map(len, carried)) < 60_000
+    assert len(text.encode()) - sum(map(len, carried)) < 68_000
 
 
 def test_modules_joined_into_one_keep_their_names_apart():

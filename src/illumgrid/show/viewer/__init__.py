@@ -15,7 +15,17 @@ from typing import Any
 
 from illumgrid.light import Illumination
 
-MODULES = ("numbers", "camera", "state", "sweeps", "lights", "input", "picture", "view")  # each imports from earlier
+MODULES = (
+    "numbers",
+    "camera",
+    "state",
+    "sweeps",
+    "lights",
+    "skies",
+    "input",
+    "picture",
+    "view",
+)  # each imports from earlier
 SHADERS = ("shared.glsl", "ray.vert", "field.frag", "wall.vert", "wall.frag", "copy.frag")
 
 
@@ -65,7 +75,7 @@ def page(light: Illumination, up: str | None = None) -> str:
     Returns
     -------
     str
-        The file's text; about the size of the gzipped field and grid, times 4/3, and 60 KB.
+        The file's text; about the size of the gzipped field and grid, times 4/3, and 66 KB.
     """
     from illumgrid.show.viewer.packing import packed
 

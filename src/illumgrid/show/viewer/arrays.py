@@ -107,6 +107,11 @@ def _half(values: NDArray[np.floating]) -> NDArray[np.uint16]:
     return half
 
 
+def half_planes(values: NDArray[np.floating]) -> bytes:
+    """Half floats, low bytes before high bytes."""
+    return _planes(_half(values).ravel())
+
+
 def pack_values(steps: NDArray[Any], into: Bytes) -> dict[str, Any]:
     """Field values (nx, ny, nz) as differences along x."""
     x_fastest = np.ascontiguousarray(steps.transpose(2, 1, 0))
@@ -135,7 +140,7 @@ def pack_layers(
     for name, row, values in zip(channels.names, mixed(channels, layers, {}).mix, np.moveaxis(light, -1, 0)):
         if layer := name.rpartition(".")[0]:
             peak = max(row)  # half floats reach as far as the picture needs, however bright a light is
-            data = _planes(_half(values.T * peak).ravel())
+            data = half_planes(values.T * peak)
             color = [share / peak for share in row[:colors]]
             packed.append({"light": names.index(layer), "color": color, "offset": into.add(data)})
     return packed

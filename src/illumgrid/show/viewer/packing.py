@@ -15,10 +15,13 @@ from illumgrid.field.layers import layers_of
 from illumgrid.field.scene import Field, Scene
 from illumgrid.field.upright import axes_of, up_of
 from illumgrid.field.volume import Floats, Lattice, box_corners, histogram
+from illumgrid.grid.channels import Channels
+from illumgrid.grid.nodes import reachable
 from illumgrid.light import Illumination
 from illumgrid.show import trust
 from illumgrid.show.camera import HALF_ANGLE, fit_camera, outline_of
 from illumgrid.show.shade import BACKGROUND, CAP_TONE
+from illumgrid.show.viewer import skies
 from illumgrid.show.viewer.arrays import (
     HOLE,
     Bytes,
@@ -83,8 +86,10 @@ def kept_apart(light: Illumination) -> dict[str, float]:
 
 
 def _field(light: Illumination, number: int, stage: Stage, into: Bytes, notes: list[str]) -> dict[str, Any]:
-    field, whole = light.scene.fields[number], light.grids[number]
-    volume, grid = reduced(field.volume, MOST_VOXELS), thinned(whole, MOST_NODES)
+    field, whole, sky = light.scene.fields[number], light.grids[number], skies.sky_of(light)
+    kept, share = skies.fitting(light, sky) if sky else (0, 1.0)
+    most = MOST_NODES if share == 1 else min(MOST_NODES, int(share * whole.support.size))
+    volume, grid = reduced(field.volume, MOST_VOXELS), thinned(whole, most)
     sign = field.upward
     ends = sorted(sign * field.stored_range)
     steps, base, step, clamped = field_steps(volume, (ends[0], ends[1]), sign)
@@ -97,10 +102,17 @@ def _field(light: Illumination, number: int, stage: Stage, into: Bytes, notes: l
     albedo = field.material.albedo
     error = np.where(np.isfinite(grid.bar), trust.relative(whole, grid.bar), HOLE)
     scale = light.exposure / np.pi
-    shown = pack_light(grid.channels.shown(grid.light) * scale, error, into)
+    shown = pack_light(_mix(grid.channels, grid.light) * scale, error, into)
     if kept_apart(light):
         layers = layers_of(light.scene)
         shown["layers"] = pack_layers(grid.light * scale, grid.channels, layers, shown["channels"], into)
+    if sky:
+        lit = np.zeros(grid.spec.shape, bool)
+        lit.flat[reachable(field, grid.spec)] = True
+        held = skies.answers(light, sky, (grid.light.transpose(2, 1, 0, 3) * scale)[lit.T], grid.channels)
+        shown["mask"] = into.add(np.packbits(lit.T.ravel(), bitorder="little").tobytes())
+        shown["sky"], lost = skies.pack_sky(held, kept, into)
+        _note_lost(notes, field.name, kept, len(sky.coefficients), lost)
     return {
         "name": field.name,
         "range": field.range.tolist(),
@@ -125,6 +137,19 @@ def _note_reduced(
         notes.append(f"{what} was reduced for this page from {sizes} {points}.")
 
 
+def _mix(channels: Channels, light: NDArray[np.float32]) -> NDArray[np.float32]:
+    """What is shown of light (..., C), clamped only after interpolation, as `IlluminationGrid.lookup` does."""
+    return channels.shown(light) if channels.own else np.asarray(light @ np.array(channels.mix, np.float32))
+
+
+def _note_lost(notes: list[str], name: str, kept: int, of: int, lost: float) -> None:
+    if lost:
+        notes.append(
+            f"Under another sky the light of {name} is that of {kept} components for {of} basis functions of the sky: "
+            f"{lost:.1%} of it is left out, in the mean over skies."
+        )
+
+
 def _css(linear: Floats) -> str:
     return "#" + "".join(f"{int(c):02x}" for c in encode_srgb(linear))
 
@@ -141,7 +166,6 @@ def _walls(light: Illumination, stage: Stage, into: Bytes) -> tuple[list[dict[st
     quads = light.scene.quads
     if not quads:
         return [], None
-    grey = all(wall.channels.grey for wall in light.walls)
     scale, offset, described = light.exposure / np.pi, 0, []
     for quad in quads:
         nu, nv = quad.texels
@@ -160,11 +184,15 @@ def _walls(light: Illumination, stage: Stage, into: Bytes) -> tuple[list[dict[st
             }
         )
         offset += nu
-    shown = _beside([wall.channels.shown(wall.light) if grey else wall.values for wall in light.walls]) * scale
+    shown = _beside([_mix(wall.channels, wall.light) for wall in light.walls]) * scale
     atlas = pack_light(shown, np.zeros(shown.shape[:3]), into)
     if kept_apart(light):
         layers, channels = _beside([wall.light for wall in light.walls]) * scale, light.walls[0].channels
         atlas["layers"] = pack_layers(layers, channels, layers_of(light.scene), atlas["channels"], into)
+    if sky := skies.sky_of(light):
+        side = _beside([wall.light for wall in light.walls]).transpose(2, 1, 0, 3) * scale
+        held = skies.answers(light, sky, side, light.walls[0].channels)
+        atlas["sky"], _ = skies.pack_sky(held, skies.fitting(light, sky)[0], into)
     return described, atlas
 
 
@@ -219,6 +247,7 @@ def packed(light: Illumination, up: str | None = None) -> tuple[dict[str, Any], 
             "hatch": trust.HATCH.tolist(),
             "colors": [_css(color) for color in _between(trust.SCALE.astype(float))],
         },
+        "sky": skies.described(light),
         "lights": [{"name": name, "weight": weight} for name, weight in kept_apart(light).items()],
         "fields": fields,
         "walls": walls,

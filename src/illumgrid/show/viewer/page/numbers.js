@@ -53,15 +53,31 @@ const HALVES = Float32Array.from({ length: 65536 }, (_, h) => {
   return h & 32768 ? -size : size;
 });
 
-// The same texels in single precision, the light mixed from its layers: their sum is clamped, not each of them.
-export function mixedTexels(bytes, about, weights) {
+// Texels that are lit, where only those are held; else none.
+function litTexels(bytes, about, count) {
+  if (about.mask === undefined) return null;
+  const lit = [];
+  for (let i = 0; i < count; i++) if ((bytes[about.mask + (i >> 3)] >> (i & 7)) & 1) lit.push(i);
+  return Uint32Array.from(lit);
+}
+
+// The same texels in single precision, the light mixed from its layers, or from those of a sky with these coefficients:
+// their sum is clamped, after interpolation, and not each of them.
+export function mixedTexels(bytes, about, weights, sky) {
   const count = about.shape[0] * about.shape[1] * about.shape[2], each = about.channels + 1;
   const texels = new Float32Array(each * count);
-  const add = (offset, k, share) => {
-    if (share) for (let i = 0; i < count; i++) texels[each * i + k] += share * HALVES[bytes[offset + i] | (bytes[offset + count + i] << 8)];
+  const add = (offset, k, share, at = null) => {
+    const many = at ? at.length : count;
+    if (share) for (let i = 0; i < many; i++) texels[each * (at ? at[i] : i) + k] += share * HALVES[bytes[offset + i] | (bytes[offset + many + i] << 8)];
   };
-  for (const { light, color, offset } of about.layers) color.forEach((share, k) => add(offset, k, share * weights[light]));
-  for (let i = 0; i < texels.length; i++) texels[i] = Math.max(0, Math.min(65504, texels[i]));
+  for (const { light, color, offset } of about.layers ?? []) color.forEach((share, k) => add(offset, k, share * weights[light]));
+  about.lit ??= litTexels(bytes, about, count);
+  for (const { color, basis, offset } of sky ? about.sky : []) {
+    for (let k = 0; k < about.channels; k++) {
+      if (color < 0 || color === k) add(offset, k, basis ? basis.reduce((s, f, b) => s + f * sky[b][k], 0) : 1, about.lit);
+    }
+  }
+  for (let i = 0; i < texels.length; i++) texels[i] = Math.max(-65504, Math.min(65504, texels[i]));
   add(about.offset + 2 * count * about.channels, about.channels, 1); // the error, whose holes are negative
   return texels;
 }

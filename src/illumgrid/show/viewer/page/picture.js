@@ -2,7 +2,8 @@
 
 import { bricks, fieldValues, lightTexels, mixedTexels } from "./numbers.js";
 import { dot, eyeOf, facing, sum } from "./camera.js";
-import { isovalueOf } from "./state.js";
+import { skyTurned } from "./skies.js";
+import { DEFAULTS, isovalueOf } from "./state.js";
 
 export const LOOKS = ["matte", "shiny", "translucent"];
 const LAYERS = 4; // surfaces behind one another that a translucent look shows
@@ -74,7 +75,7 @@ export class Picture {
     });
     this.walls = scene.atlas ? this.light(scene.atlas, data) : null;
     this.size = [0, 0];
-    if (scene.lights.length) Object.assign(this, { data, weights: String(scene.lights.map((light) => light.weight)) });
+    if (scene.lights.length || scene.sky) Object.assign(this, { data, mixed: String([scene.lights.map((light) => light.weight), DEFAULTS.turn]) });
   }
 
   volume(format, layout, type, [nx, ny, nz], values, filter) {
@@ -93,14 +94,15 @@ export class Picture {
     return this.volume(format, layout, gl.HALF_FLOAT, about.shape, lightTexels(data, about), gl.LINEAR);
   }
 
-  // Light of fields and walls under other weights; until they change, it is the stored one.
-  mix(weights) {
-    if (!this.data || this.weights === String(weights)) return;
-    this.weights = String(weights);
+  // Light of fields and walls under other weights, or the turned sky; until they change, it is the stored one.
+  mix({ weights, turn }) {
+    if (!this.data || this.mixed === String([weights, turn])) return;
+    this.mixed = String([weights, turn]);
+    const sky = this.scene.sky && skyTurned(this.scene.sky.coefficients, turn);
     const gl = this.gl, lit = this.scene.fields.map((field, k) => [this.fields[k].light, field.light]);
     for (const [texture, about] of this.walls ? [...lit, [this.walls, this.scene.atlas]] : lit) {
       gl.bindTexture(gl.TEXTURE_3D, texture);
-      gl.texSubImage3D(gl.TEXTURE_3D, 0, 0, 0, 0, ...about.shape, about.channels === 1 ? gl.RG : gl.RGBA, gl.FLOAT, mixedTexels(this.data, about, weights));
+      gl.texSubImage3D(gl.TEXTURE_3D, 0, 0, 0, 0, ...about.shape, about.channels === 1 ? gl.RG : gl.RGBA, gl.FLOAT, mixedTexels(this.data, about, weights, sky));
     }
   }
 

@@ -16,7 +16,7 @@ float depthOf(float t) { return t / (1.0 + t); }
 float distanceOf(float depth) { return depth / (1.0 - depth); }
 bool isLocal() { return gl_FragCoord.x < uLocalUpTo; }
 bool isTrust() { return uTrust.y > 0.0; }
-vec3 lightOf(vec4 texel) { return uGrey ? texel.rrr : texel.rgb; }
+vec3 lightOf(vec4 texel) { return max(uGrey ? texel.rrr : texel.rgb, 0.0); }
 float errorOf(vec4 texel) { return uGrey ? texel.g : texel.a; }
 
 void draw(vec3 color, float alpha) { color_ = vec4(clamp(color, 0.0, 1.0) * alpha, alpha); }

@@ -1,6 +1,6 @@
 // What the page shows, and the same in its address.
 
-export const DEFAULTS = { sweep: 0.5, light: "global", split: 0.5, stops: 0, look: "matte", trust: false };
+export const DEFAULTS = { sweep: 0.5, light: "global", split: 0.5, stops: 0, look: "matte", trust: false, turn: [0, 0] };
 
 const short = (x) => String(Number(x.toPrecision(6)));
 export const clamp = (x, low, high) => Math.min(high, Math.max(low, x));
@@ -19,6 +19,7 @@ export function written(state, scene) {
   if (state.look !== DEFAULTS.look) parts.push(`look=${state.look}`);
   if (state.stops) parts.push(`stops=${short(state.stops)}`);
   if (state.trust) parts.push("trust=1");
+  if (String(state.turn) !== String(DEFAULTS.turn)) parts.push(`turn=${state.turn.map(short).join(",")}`);
   if (scene.lights.some(({ weight }, k) => weight !== state.weights[k])) parts.push(`weights=${state.weights.map(short).join(",")}`);
   return parts.join("&");
 }
@@ -32,6 +33,8 @@ export function read(address, scene, looks) {
   if (view.length === 6 && view.every(Number.isFinite) && view[2] > 0) {
     state.view = { azimuth: view[0], elevation: clamp(view[1], -1.5533, 1.5533), distance: view[2], target: view.slice(3), moved: true };
   }
+  const turn = (given.get("turn") ?? "").split(",").map(Number);
+  if (scene.sky && turn.length === 2 && turn.every(Number.isFinite)) state.turn = turn;
   const weights = (given.get("weights") ?? "").split(",").map(Number);
   if (given.get("weights") && weights.length === scene.lights.length && weights.every(Number.isFinite)) state.weights = weights;
   if (["global", "local", "both"].includes(given.get("light"))) state.light = given.get("light");

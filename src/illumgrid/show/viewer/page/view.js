@@ -4,6 +4,7 @@ import { fitted } from "./camera.js";
 import { listen, listenSplit } from "./input.js";
 import { lights } from "./lights.js";
 import { LOOKS, Picture } from "./picture.js";
+import { skyBall } from "./skies.js";
 import { DEFAULTS, clamp, isovalueOf, read, written } from "./state.js";
 import { formatted, sweeps } from "./sweeps.js";
 
@@ -31,10 +32,13 @@ export function view(root, scene, data, shaders, { address = true, onChange = ()
   const show = sweeps(part("sweeps"), scene.fields, (sweep) => put({ sweep }));
   const weigh = lights(part("lights"), scene.lights, () => state.weights, (weights) => put({ weights }));
 
+  const ball = skyBall(part("ball"), scene, () => state.turn, (turn) => put({ turn }));
+
   function controls() {
     show(state.sweep);
     weigh(state.weights);
-    part("opened").hidden = String(state.weights) === String(opened.weights);
+    ball(state.turn, state.view);
+    part("opened").hidden = String([state.weights, state.turn]) === String([opened.weights, opened.turn]);
     for (const choice of root.querySelectorAll("[data-choice]")) {
       const kind = choice.dataset.choice;
       for (const input of choice.querySelectorAll("input")) input.checked = input.value === state[kind];
@@ -82,7 +86,7 @@ export function view(root, scene, data, shaders, { address = true, onChange = ()
   function frame() {
     asked = false;
     size();
-    picture.mix(state.weights);
+    picture.mix(state);
     const moving = !fresh && performance.now() - changed < REST;
     const begun = performance.now(), divide = moving ? coarse : 1;
     picture.sample(state, Math.ceil(canvas.width / divide), Math.ceil(canvas.height / divide), moving ? [0.5, 0.5] : PLACES[samples], moving ? 0 : samples);
