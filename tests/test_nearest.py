@@ -6,7 +6,7 @@ import pytest
 from illumgrid.field.volume import Volume
 from illumgrid.grid import GridSpec, Nodes
 from illumgrid.interpolators import nearest
-from illumgrid.interpolators.nearest import Nearest
+from illumgrid.interpolators.nearest import Nearest, on_nodes
 from illumgrid.samplers.direct import Direct
 from illumgrid.stages import Interpolator
 from illumgrid.transport.samples import Queries, Samples, join_queries
@@ -104,3 +104,11 @@ def test_slabs_of_nodes_do_not_show(monkeypatch):
 
 def test_nearest_is_an_interpolator_without_options():
     assert isinstance(Nearest(), Interpolator) and Nearest.name == "nearest" and Nearest() == Nearest()
+
+
+def test_samples_on_nodes_fill_them_without_a_search_and_coincident_ones_are_searched():
+    spec = GridSpec.over(Volume(np.zeros((4, 4, 4))), 4)
+    points = np.array([[1.0, 1, 1], [1 + 1e-8, 2, 2], [1, 1, 2], [1, 1, 2 + 1e-9], [2.4, 1, 1]])
+    node, sample = on_nodes(spec, points)
+    assert sample.tolist() == [0, 1]
+    assert node.tolist() == [1 * 16 + 1 * 4 + 1, 1 * 16 + 2 * 4 + 2]

@@ -36,6 +36,14 @@ def _overlapped(cells: int, grid_cells: int) -> list[slice]:
     return [slice(int(a), int(b)) for a, b in zip(first, last)]
 
 
+def _any_overlapped(cells: NDArray[np.bool_], parts: list[slice], axis: int) -> NDArray[np.bool_]:
+    """Whether any of the cells of each part is marked, along an axis."""
+    ends = [end for part in parts for end in (part.start, part.stop)]
+    beyond = np.zeros_like(cells.take([0], axis))  # the end of the last part must be a place as well
+    whole = np.logical_or.reduceat(np.concatenate([cells, beyond], axis), ends, axis)
+    return np.asarray(whole.take(np.arange(0, len(ends), 2), axis))
+
+
 def reachable(field: Field, spec: GridSpec) -> NDArray[np.int64]:
     """Flat numbers of the nodes that a lookup on some isosurface of the field's range can read.
 
@@ -45,8 +53,7 @@ def reachable(field: Field, spec: GridSpec) -> NDArray[np.int64]:
     crossed = np.zeros([len(parts) for parts in along], bool)
     for row, cells in enumerate(along[0]):  # a layer of grid cells at a time: bounds the memory
         layer = np.asarray(_crossed_cells(field, cells).any(axis=0))
-        layer = np.stack([layer[part].any(axis=0) for part in along[1]])
-        crossed[row] = np.stack([layer[:, part].any(axis=1) for part in along[2]], axis=1)
+        crossed[row] = _any_overlapped(_any_overlapped(layer, along[1], 0), along[2], 1)
     nodes = np.zeros(spec.shape, bool)
     for corner in np.ndindex(2, 2, 2):
         nodes[tuple(slice(c, c + n) for c, n in zip(corner, crossed.shape))] |= crossed

@@ -4,13 +4,16 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 
-from illumgrid.grid import IlluminationGrid, Nodes
+from illumgrid.field.volume import Floats, world_to_index
+from illumgrid.grid import GridSpec, IlluminationGrid, Nodes
 from illumgrid.interpolators.neighbours import diagonal, near_samples
 from illumgrid.stages import Interpolator, hookimpl
 from illumgrid.transport.samples import Samples
 
 _SLAB = 1 << 18  # nodes per search: bounds the memory
+_ON_A_NODE = 1e-6  # of a spacing: no other sample is nearer
 
 
 @dataclass(frozen=True)
@@ -28,19 +31,36 @@ class Nearest:
         error = np.full(len(nodes), np.inf, np.float32)
         support = np.zeros(len(nodes), np.float32)
         errors = None if samples.errors is None else np.full(light.shape, np.inf, np.float32)
+        own_error, own_errors = good.error, good.errors
+
+        def take(node: NDArray[np.integer], sample: NDArray[np.integer]) -> None:
+            light[node], error[node], support[node] = good.light[sample], own_error[sample], 1.0
+            if errors is not None and own_errors is not None:
+                errors[node] = own_errors[sample]
+
         if len(good):
             # Coordinates relative to the grid's origin: differences of large world coordinates would lose digits.
             tree = KDTree(good.queries.point - spec.origin)
-            reach, own_error, own_errors = diagonal(spec), good.error, good.errors
-            for block in nodes.blocks(np.flatnonzero(near_samples(spec, good.queries.point, reach)), _SLAB):
+            reach = diagonal(spec)
+            candidates = near_samples(spec, good.queries.point, reach).reshape(-1)
+            node, sample = on_nodes(spec, good.queries.point)
+            take(node, sample)
+            candidates[node] = False
+            for block in nodes.blocks(np.flatnonzero(candidates), _SLAB):
                 distance, sample = tree.query(block.point - spec.origin, distance_upper_bound=reach)
                 near = np.isfinite(distance)
-                light[block.flat[near]] = good.light[sample[near]]
-                error[block.flat[near]] = own_error[sample[near]]
-                support[block.flat[near]] = 1.0
-                if errors is not None and own_errors is not None:
-                    errors[block.flat[near]] = own_errors[sample[near]]
+                take(block.flat[near], sample[near])
         return nodes.grid(light, error, support, samples.channels, errors)
+
+
+def on_nodes(spec: GridSpec, points: Floats) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Flat numbers (m,) of the nodes that are one of the world points (n, 3), and which (m,); none that are two."""
+    index = world_to_index(spec, points)
+    closest = np.clip(np.round(index), 0, np.array(spec.shape) - 1)
+    point = np.flatnonzero((np.abs(index - closest) < _ON_A_NODE).all(axis=1))
+    node = np.ravel_multi_index(tuple(closest[point].astype(np.int64).T), spec.shape)
+    alone = np.bincount(node, minlength=1)[node] == 1
+    return node[alone], point[alone]
 
 
 @hookimpl
