@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import illumgrid as ig
+from illumgrid import unfinished
 from illumgrid.bake import bake
 from illumgrid.field.lattice import specs_over
 from illumgrid.field.scene import level_table
@@ -207,3 +208,35 @@ def test_every_fourth_node_comes_first(call, pieces):
     (texels,) = wall_queries(scene, levels)
     ranks = coarse_first(scene, specs, levels, texels).reshape(5, *scene.quads[0].texels[::-1])
     assert (ranks[::4, ::4, ::4] == 0).all() and (ranks == 0).sum() == ranks[::4, ::4, ::4].size
+
+
+def test_a_run_on_its_way_can_be_looked_at(call, pieces, tmp_path):
+    """Every second node is finished, with the light that it will have; its neighbours show that until then."""
+    pieces(-1)
+    call(*RUN, "--paths", "4", "-o", "whole")
+    pieces(6)
+    call(*RUN, "--paths", "4", "-o", "out", code=130)
+    assert "of a run" in call("preview", "out", "-o", "a.png") and (tmp_path / "a.png").exists()
+    call("view", "out.partial", "--export", "page.html")
+    found, share = unfinished.load(tmp_path / "out.partial")
+    lit, done = found.grids[0], ig.load("whole").grids[0]
+    assert 0 < share < 0.9 and not np.array_equal(lit.light, done.light)
+    (asked,) = Direct().queries(found.scene, specs_over(found.scene, 9), 0)
+    own = np.all((asked.level > 0.3) & (asked.level < 0.9), axis=1)  # others are moved onto the ends of the range
+    nodes = np.stack(np.unravel_index(asked.id[own].astype(int), lit.spec.shape))
+    second = tuple(nodes[:, (nodes % 2 == 0).all(axis=0)])
+    assert len(second[0]) > 10
+    np.testing.assert_array_equal(lit.light[second], done.light[second])
+
+
+def test_nodes_far_from_all_that_is_finished_are_striped():
+    scene = ig.Scene.sky(ball(30), range=(0.3, 0.9))
+    spec = ig.GridSpec.over(scene.fields[0].volume, 30)
+    grid = ig.IlluminationGrid(spec, *(np.ones((*spec.shape, *c)) for c in ((1,), (), ())))
+    known = ig.Samples(
+        ig.Queries.at(scene, spec.nodes([0])), *np.ones((2, 1, 1), np.float32), np.ones(1, np.int32), grid.channels
+    )
+    marked = unfinished._marked(grid, known)
+    far = np.linalg.norm(np.stack(np.indices(spec.shape)), axis=0) > unfinished.REACH
+    np.testing.assert_array_equal(marked.support == 0, far)
+    assert set(np.unique(marked.light[far])) == {0.0, 1.5} and (marked.light[~far] == 1).all()

@@ -243,7 +243,8 @@ def texel_paths(nodes: int, texels: int) -> int:
     return int(np.clip(nodes // max(texels, 1), 1, 8))
 
 
-def _wall_texture(rows: int, quad: Quad, answer: Samples) -> WallTexture:
+def wall_texture(rows: int, quad: Quad, answer: Samples) -> WallTexture:
+    """The texture of a quad from the samples at its texels, for so many rows of levels; its noise is calmed."""
     nu, nv = quad.texels
     support = (answer.paths > 0).astype(np.float32).reshape(rows, nv, nu)
     texel = np.linalg.norm(quad.edge_v) / nv, np.linalg.norm(quad.edge_u) / nu
@@ -386,7 +387,7 @@ def bake(
         grids.append(fill_nodes(interpolator, samples, Nodes(spec, scene.fields[number], number)))
         del samples
         progress("grid", number + 1, len(specs))
-    walls = [_wall_texture(len(levels.table), quad, answer) for quad, answer in zip(scene.quads, answers)]
+    walls = [wall_texture(len(levels.table), quad, answer) for quad, answer in zip(scene.quads, answers)]
     clock.append(time.perf_counter())
     return Baked(
         grids=tuple(grids),

@@ -14,6 +14,30 @@ from illumgrid.errors import BadInput
 if TYPE_CHECKING:
     from illumgrid.field.scene import Scene
     from illumgrid.io.partial import Partial
+    from illumgrid.light import Illumination
+
+
+def loaded(folder: Path) -> "Illumination":
+    """The light of a finished run, or of one on its way, of which it is said how far it is."""
+    from illumgrid import unfinished
+    from illumgrid.chain import load
+
+    place = unfinished.place_of(folder)
+    if place is None:
+        return load(folder)
+    light, share = unfinished.load(place)
+    say(f"note: {place} is {share:.0%} of a run: between finished nodes the light is coarse, stripes are not lit yet")
+    return light
+
+
+def check_spread(workers: int | None, dask: str | None) -> None:
+    """Refuse what no cluster can be made of, before anything is read."""
+    from importlib.util import find_spec
+
+    if workers is not None and dask is not None:
+        raise BadInput("--workers and --dask came together; expected one: a new local cluster, or one that exists")
+    if (workers is not None or dask is not None) and find_spec("distributed") is None:
+        raise BadInput("several workers need dask.distributed; pip install 'illumgrid[dask]'")
 
 
 def kept(
@@ -78,8 +102,6 @@ def shared_out(stages: Mapping[str, Any], workers: int | None) -> dict[str, Any]
 @contextmanager
 def spread(workers: int | None, dask: str | None, any_machine: bool) -> Iterator[Callable[..., Any]]:
     """What spreads the work: this process, `workers` processes, or the workers of the scheduler `dask`."""
-    if workers is not None and dask is not None:
-        raise BadInput("--workers and --dask came together; expected one: a new local cluster, or one that exists")
     if workers is None and dask is None:
         yield map
         return

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from illumgrid.cli.lights import SkyImage, Turn, Weights, relit
+from illumgrid.cli.long import loaded
 from illumgrid.cli.terminal import progress_bars, say
 from illumgrid.errors import BadInput, shown, shown_range
 
@@ -125,7 +126,6 @@ def preview(
 ) -> None:
     """Draw an isosurface of a finished run, several side by side, or a sweep through the range."""
     from illumgrid import show
-    from illumgrid.chain import load
 
     given = {
         "--sweep": sweep is not None, "--isovalue": isovalue is not None, "--isovalues": isovalues is not None,
@@ -138,7 +138,7 @@ def preview(
     several = None if isovalues is None else _numbers(isovalues)
     engine_used, why = show.choose_engine(engine if exact is None else "software")
     gathered = None if exact is None else _exact(exact)
-    light = relit(load(folder), weights, sky, turn)
+    light = relit(loaded(folder), weights, sky, turn)
     options: dict[str, Any] = {"background": background, "engine": engine_used, "stops": exposure}
     if size != SIZE:
         options |= {"width": size[0], "height": size[1]}

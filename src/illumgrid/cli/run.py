@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from illumgrid.cli.long import kept, shared_out, spread
+from illumgrid.cli.long import check_spread, kept, shared_out, spread
 from illumgrid.cli.reading import Array, Channel, Crop, Downsample, Label, Spacing, Time, check_inside, given, labels_of
 from illumgrid.cli.terminal import Ignore, omitted_light, progress_bars, reported_warnings, say
 from illumgrid.errors import BadInput, shown_range, tell
@@ -282,6 +282,7 @@ def run(
     from illumgrid.io import store
 
     with reported_warnings(ignore) as sentences:
+        check_spread(workers, dask)
         names = {"sampler": sampler, "backend": backend, "interpolator": interpolator}
         stages = _stages(names, settings or [], {"backend.threads": threads, "sampler.count": isovalues})
         reading = given(

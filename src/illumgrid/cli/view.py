@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from illumgrid.cli.lights import SkyImage, Turn, Weights, relit
+from illumgrid.cli.long import loaded
 from illumgrid.cli.terminal import say
 from illumgrid.errors import BadInput
 
@@ -29,14 +30,13 @@ def view(
     ] = None,
 ) -> None:
     """Sweep the isovalue interactively: in the browser, in a file to send, or in a window."""
-    from illumgrid.chain import load
     from illumgrid.io import disk
 
     if export is not None and export.suffix.lower() not in (".html", ".htm"):
         raise BadInput(f"--export is {export.name!r}; expected a file name that ends in .html")
     if desktop and (export is not None or no_open or up is not None):
         raise BadInput("--desktop came with --export, --no-open or --up; expected it alone")
-    light = relit(load(folder), weights, sky, turn)
+    light = relit(loaded(folder), weights, sky, turn)
     if desktop:
         from illumgrid.show.viewer.desktop import show
 

@@ -14,11 +14,11 @@ import json
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, fields, is_dataclass
+from dataclasses import asdict, dataclass, fields, is_dataclass
 from importlib.metadata import version
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -356,7 +356,7 @@ def beside(folder: Path) -> Path:
     return folder.with_name(folder.name + SUFFIX)
 
 
-def opened(place: Path) -> Any:
+def opened(place: Path, mode: Literal["r", "r+"] = "r+") -> Any:
     """The group of a partial run.
 
     Raises
@@ -366,10 +366,35 @@ def opened(place: Path) -> Any:
     """
     import zarr
 
-    group = zarr.open_group(str(place / LIGHT), mode="r+", zarr_format=3)
+    group = zarr.open_group(str(place / LIGHT), mode=mode, zarr_format=3)
     if group.attrs.get("format") != FORMAT:
         raise BadInput(f"its format is {group.attrs.get('format')!r}; expected {FORMAT}")
     return group
+
+
+@dataclass(frozen=True)
+class Kept:
+    """What a partial run holds: its attributes, and for each range of paths arrays and ``channels``, in work order."""
+
+    attributes: Record
+    ranges: dict[str, Record]
+
+
+def is_partial(place: Path) -> bool:
+    """Whether a folder looks like a partial run."""
+    return (place / LIGHT / "zarr.json").is_file()
+
+
+def read(place: Path) -> Kept:
+    """Read a partial run, which may be growing."""
+    group = opened(place, mode="r")
+    found = {}
+    for name in _ranges(group):
+        part = group[name]
+        paths = part["paths"][:]  # first: a row that it counts is there
+        arrays = {"light": part["light"][:], "spread": part["spread"][:], "paths": paths}
+        found[name] = {**arrays, "channels": _channels(part.attrs["channels"])}
+    return Kept(dict(group.attrs), found)
 
 
 def _name(paths: range) -> str:
