@@ -79,7 +79,6 @@ def pictures(engine):
         for local in (False, True):
             drawn[f"{name}, {'local' if local else 'global'}"] = render(light, local=local, engine=engine, **SIZE)
     light = varied(lit(sky(), nodes=7))
-    drawn["block"] = grid_volume(light, cut=True, engine=engine, **SIZE)
     drawn["seen from behind"] = render(light, view="back", zoom=1.5, background="white", engine=engine, **SIZE)
     drawn["nothing"] = render(light, isovalue=1.19, engine=engine, **SIZE)
     drawn["other size"] = render(light, engine=engine, width=61, height=77)
@@ -88,7 +87,7 @@ def pictures(engine):
 
 NAMES = ["oblique", "mirrored", "room", "cap", "far"]
 ALL = [f"{n}, {light}" for n in NAMES for light in ("global", "local")] + [
-    "block", "seen from behind", "nothing", "other size"]  # fmt: skip
+    "seen from behind", "nothing", "other size"]  # fmt: skip
 
 
 def child(script, folder, **environment):

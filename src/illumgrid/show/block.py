@@ -1,4 +1,7 @@
-"""The illumination grid as a block of light, whole or with the corner towards the eye cut out (Figure 6)."""
+"""The illumination grid as a block of light, whole or with the corner towards the eye cut out (Figure 6).
+
+Nothing but light is drawn: where no isosurface of the range passes one looks through, to the isosurface behind.
+"""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -7,17 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from illumgrid.field.upright import axes_of
-from illumgrid.field.volume import Floats, index_to_world
+from illumgrid.field.volume import Floats, interpolate, world_to_index
 from illumgrid.grid import GridSpec, read_lattice
 from illumgrid.show.camera import Camera
 from illumgrid.show.engines import software
 from illumgrid.show.shade import Colors, Shown, opaque
-from illumgrid.show.triangles import Colored, squares
+from illumgrid.tone import curve
 
 NEAR = 1e-9  # index units: a ray this close to the octant that was cut out enters it
 FACES = 0.8, 0.9, 1.0  # tones of faces across, along and above the view from the front, so that edges show
-STEPS = 256  # squares along a side, at least about: between nodes light is bilinear, in triangles linear
-HOLE = 0.3  # tone between holes only: no level set within the range passes there
+STEP = 0.7  # nodes, by which a ray looks for light
+HALVINGS = 6  # of such a step, to find where light begins
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,12 +72,48 @@ class Block:
         across = np.abs(self.spec.direction.T @ np.stack(axes_of(self.spec.direction), axis=1))
         return np.asarray(across @ [FACES[0], FACES[1], FACES[2]])
 
-    def color(self, points: Floats, axis: NDArray[np.integer]) -> Colors:
-        """Display-linear colours (n, 3) at world points (n, 3) in faces across these axes (n,)."""
-        grid = self.shown.light.grids[self.number]
-        known = read_lattice(self.spec, (grid.support > 0)[..., None].astype(np.float32), points)
-        tone = (HOLE + (1 - HOLE) * known) * self.tones[axis][:, None]
-        return np.asarray(tone * self.shown.field(self.number, points, np.zeros(len(points))), dtype=np.float32)
+    @cached_property
+    def glow(self) -> NDArray[np.float32]:
+        """Light (nx, ny, nz, 4) as it is exposed, and how far the isovalue of a node is within the range, its span 1.
+
+        Holes have the light around them, smoothly: that of the nearest node would show as shards.
+        """
+        light = self.shown.light
+        grid, field = light.grids[self.number], light.scene.fields[self.number]
+        albedo = field.material.albedo / np.pi * self.shown.exposure
+        filled = _filled(grid.values * albedo.astype(np.float32), grid.support > 0)
+        low, high = field.range
+        isovalue = interpolate(field.volume, world_to_index(field.volume, self.spec.nodes()))
+        within = np.minimum(isovalue - low, high - isovalue) / (high - low)
+        return np.concatenate([filled, within.reshape(*self.spec.shape, 1).astype(np.float32)], axis=-1)
+
+    def color(self, points: Floats, tone: Floats) -> Colors:
+        """Display-linear colours (n, 3) at world points (n, 3) on something of this tone (n,)."""
+        light = read_lattice(self.spec, self.glow, points)[:, :3]
+        return np.asarray(tone[:, None] * curve(light), np.float32)
+
+    def lit(self, directions: Floats, near: Floats, far: Floats, slope: Floats) -> Floats:
+        """Distances (n,) at which rays from the eye along `directions` meet light between near and far; inf if none."""
+        found = np.full(len(near), np.inf)
+        step = STEP / np.abs(slope).max(axis=1)
+        active, t = np.arange(len(near)), near * 1.0
+        while len(active):
+            here = self.eye + t[active, None] * directions[active]
+            inside = read_lattice(self.spec, self.glow, here)[:, 3] >= 0
+            found[active[inside]] = t[active[inside]]
+            active = active[~inside]
+            t[active] += step[active]
+            active = active[t[active] < far[active]]
+        again = np.flatnonzero(np.isfinite(found) & (found > near))
+        high = found[again]
+        low = high - step[again]
+        for _ in range(HALVINGS):
+            middle = 0.5 * (low + high)
+            points = self.eye + middle[:, None] * directions[again]
+            inside = read_lattice(self.spec, self.glow, points)[:, 3] >= 0
+            low, high = np.where(inside, low, middle), np.where(inside, middle, high)
+        found[again] = high
+        return found
 
     def draw(self, camera: Camera, width: int, height: int, background: Colors) -> NDArray[np.uint8]:
         """Picture (height, width, 4), sRGB and coverage."""
@@ -92,38 +131,31 @@ class Block:
                 t, axis = np.where(open_, inner, t), np.where(open_, inner_axis, axis)
                 hit &= t < far * (1 - NEAR)
             color = np.tile(background, (len(directions), 1))
-            color[hit] = opaque(self.color(camera.eye + t[hit, None] * directions[hit], axis[hit]))
+            rays = np.flatnonzero(hit)
+            found = self.lit(directions[rays], t[rays], far[rays], slope[rays])
+            lit = np.isfinite(found)
+            rays, found = rays[lit], found[lit]
+            tone = np.where(found > t[rays], 1.0, self.tones[axis[rays]])  # isosurfaces show their own shades
+            color[rays] = opaque(self.color(self.eye + found[:, None] * directions[rays], tone))
             return color
 
         return software.traced(seen, camera, width, height)
 
-    def sheets(self) -> list[Colored]:
-        """The faces as triangles between the nodes, with those of the middle where the octant is cut out."""
-        low, high = self.octant
-        found = []
-        for axis in range(3):
-            inner, outer = (low, high) if low[axis] > 0 else (high, low)
-            found.append(self._sheet(axis, self.last[axis] - outer[axis], cut=False, inside=False))
-            found.append(self._sheet(axis, outer[axis], cut=self.cut, inside=False))
-            if self.cut:
-                found.append(self._sheet(axis, inner[axis], cut=True, inside=True))
-        return found
 
-    def _sheet(self, axis: int, plane: float, cut: bool, inside: bool) -> Colored:
-        """The plane of this index across an axis; if `cut`, its part `inside` the octant or the rest of it."""
-        low, high = self.octant
-        steps = max(1, STEPS // max(self.spec.shape))
-        u, v = (k for k in range(3) if k != axis)
-        nu, nv = (steps * int(self.last[k]) + 1 for k in (u, v))
-        i, j = (x.ravel() / steps for x in np.indices((nu, nv)))
-        index = np.insert(np.stack([i, j], axis=1), axis, plane, axis=1)
-        faces = squares(nu, nv)
-        if cut:
-            middle = index[faces].mean(axis=1)[:, [u, v]]
-            within = ((middle > low[[u, v]]) & (middle < high[[u, v]])).all(axis=1)
-            faces = faces[within == inside]
-        points = index_to_world(self.spec, index)
-        return Colored(points, faces, self.color(points, np.full(len(points), axis)))
+def _filled(light: NDArray[np.float32], known: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """Light (nx, ny, nz, 3), where it is not known the mean around by Gaussian weights, as narrow as knows any."""
+    from scipy.ndimage import gaussian_filter
+
+    filled, missing, sigma = light.copy(), ~known, 1.0
+    while missing.any() and known.any():
+        weight = gaussian_filter(known.astype(np.float32), sigma, mode="nearest")
+        near = missing & (weight > 1e-3)
+        for color in range(3):
+            total = gaussian_filter(np.where(known, light[..., color], 0).astype(np.float32), sigma, mode="nearest")
+            filled[near, color] = total[near] / weight[near]
+        missing &= ~near
+        sigma *= 2
+    return filled
 
 
 def _through(

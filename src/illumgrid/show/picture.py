@@ -226,9 +226,7 @@ def grid_volume(
         axes = axes_of(spec.direction, up_of(light.scene) if up is None else up)
         camera = camera_around(box_corners(spec), axes, width / height, view or (30.0, 24.0), zoom, roll)
     block = Block(_shown(light, field, None, False, False, stops), number, camera.eye, cut)
-    if sheet.engine == "software":
-        return sheet.finished(block.draw(camera, width, height, sheet.background))
-    return sheet.finished(gl.draw(block.sheets(), camera, width, height, sheet.background, sheet.engine))
+    return sheet.finished(block.draw(camera, width, height, sheet.background))
 
 
 def _sheet(width: int, height: int, background: str | None, engine: str) -> _Sheet:
