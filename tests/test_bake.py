@@ -1,5 +1,6 @@
 """The accumulator: walks go on, combine, and come back from plain arrays."""
 
+import warnings
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from io import BytesIO
@@ -92,6 +93,11 @@ def test_any_map_gives_the_same_and_tells_how_far_it_is(begun):
     assert reported[0] == ("light", 0, total) and reported[-1] == ("light", total, total)
 
 
+def test_a_bake_without_targets_has_a_state():
+    again = Bake.from_state(Bake.of((), 3, SEED).state())
+    assert (again.targets, again.answers, again.bounces, again.seed) == ((), (), 3, SEED)
+
+
 def test_seeds_beside_a_seed_stay_within_64_bits():
     assert shifted_seed(2**64 - 1, 1) == 0 and shifted_seed(5, 2**63) == 2**63 + 5
 
@@ -179,6 +185,11 @@ def test_light_of_a_backend_that_cannot_be_judged_is_kept():
     with pytest.warns(ig.IllumgridWarning, match="could not be measured.*geometry"):
         light = ig.run(pair(), backend=Plain(), grid=6, paths=2, bounces=1, isovalues=2, judge=True)
     assert light.recipe["reached"] is None and light.grids[0].mean > 0
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("error")
+        again = ig.run(pair(), backend=Plain(), grid=6, paths=2, bounces=1, isovalues=2, judge=True)
+    assert "could not be measured" in str(caught[0].message)
+    np.testing.assert_array_equal(again.grids[0].values, light.grids[0].values)
 
 
 def test_lights_that_a_backend_summed_are_not_mixed():

@@ -76,6 +76,15 @@ def spoil(queries):
     return queries
 
 
+def dimmed(light):
+    """The light of all as it is, and half of each single light."""
+    return np.concatenate([light[..., :3], light[..., 3:] / 2], axis=-1)
+
+
+def changed_if_several(samples, change):
+    return replace(samples, mean=change(samples.light), m2=samples.spread) if len(samples.channels) > 3 else samples
+
+
 def stateful(asked, answer, paths, calls=count()):  # noqa: B008
     return replace(answer, mean=answer.mean * np.float32(1 + 0.01 * next(calls)))
 
@@ -144,13 +153,16 @@ BACKENDS = {
         backend(before=spoil),
         backend(lambda asked, answer, paths: answer[::-1]),
         backend(lambda asked, answer, paths: replace(answer, mean=answer.mean.astype(float))),
-        backend(lambda asked, answer, paths: replace(answer, m2=answer.m2[:, :1])),
+        backend(lambda asked, answer, paths: replace(answer, paths=answer.paths[:, None])),
         backend(lambda asked, answer, paths: replace(answer, mean=answer.mean * np.float32(np.nan))),
         backend(lambda asked, answer, paths: replace(answer, mean=-answer.mean)),
         backend(quick=lambda paths: range(paths.start, paths.stop - 1)),
         backend(lambda asked, answer, paths: replace(answer, mean=0 * answer.mean)),
     ],
     "test_equal_seeds_give_equal_answers": [backend(stateful)],
+    "test_lights_add_up": [
+        backend(lambda asked, answer, paths: replace(answer, mean=dimmed(answer.light), m2=answer.spread)),
+    ],
     "test_answers_do_not_depend_on_the_batch": [
         backend(lambda asked, answer, paths: replace(answer, mean=answer.mean * np.float32(1 + 1e-4 * len(asked)))),
         backend(before=lambda asked: replace(asked, id=np.arange(len(asked), dtype=np.uint64))),
@@ -198,6 +210,10 @@ INTERPOLATORS = {
         interpolator(
             before=lambda samples: samples if len(samples.channels) > 1 else replace(samples, mean=samples.mean / 2)
         ),
+    ],
+    "test_single_lights_are_filled_beside_all_light": [
+        interpolator(before=lambda samples: changed_if_several(samples, dimmed)),
+        interpolator(before=lambda samples: changed_if_several(samples, lambda light: 1.001 * light)),
     ],
     "test_holes_are_passed_over": [interpolator(before=all_good)],
     "test_nothing_is_claimed_beyond_reach": [interpolator(everywhere), interpolator(black_holes)],

@@ -205,3 +205,10 @@ def test_two_fields_of_the_built_in_nucleus_light_each_other():
     # protons are red and neutrons blue: each is lit by the colour of the other
     cast = [(g[..., 0] / np.maximum(g[..., 2], 1e-9))[g[..., 2] > 0.1].mean() for g in (protons, neutrons)]
     assert cast[0] != pytest.approx(cast[1], abs=1e-3)
+
+
+@pytest.mark.parametrize("option", ["paths", "bounces", "seed"])
+def test_whole_numbers_of_any_type_are_taken_and_others_refused(option):
+    light = ig.run(sky(ball(8)), **{**QUICK, option: np.uint64(2)})
+    assert light.recipe[option] == 2 and type(light.recipe[option]) is int
+    refused(lambda: ig.run(sky(ball(8)), **{**QUICK, option: 2.5}), "2.5", "expected", "2**")

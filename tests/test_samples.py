@@ -283,3 +283,10 @@ def test_bounces_below_zero_are_refused_and_no_paths_are_not():
     refused(lambda: check_request(range(8), -1), "-1 bounces", "0")
     check_request(range(0), 0)
     check_request(range(5, 9), 3)
+
+
+def test_samples_of_other_columns_than_channels_are_refused():
+    queries = Queries.at(sky(), shell(4))
+    light, paths = np.ones((4, 2), np.float32), np.ones(4, np.int32)
+    one = Channels(("key",), ((1.0, 1.0, 1.0),))
+    refused(lambda: Samples(queries, light, light, paths, one), "2 and 2 columns", "1 channels")

@@ -34,6 +34,9 @@ class Map(Protocol):
         """Apply `function` to each piece of `work`."""
 
 
+NO_QUERIES = Queries(
+    np.zeros(0, np.uint64), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 0)), np.zeros(0, np.int32)
+)
 QUERY_ARRAYS = tuple(f.name for f in fields(Queries))
 
 
@@ -138,7 +141,7 @@ class Bake:
 
     def state(self) -> dict[str, NDArray[Any]]:
         """All that the bake holds, as plain arrays: `from_state` takes them back."""
-        queries = join_queries(self.targets)
+        queries = join_queries(self.targets or (NO_QUERIES,))
         arrays = {name: getattr(queries, name) for name in QUERY_ARRAYS}
         if self.answers:
             samples, channels = self.samples, self.samples.channels

@@ -1,5 +1,6 @@
 """From a scene to its light, and from a folder: where names of stages become objects."""
 
+import operator
 import os
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -14,9 +15,9 @@ from illumgrid.accuracy.choose import JUDGED, Plan, planned
 from illumgrid.accuracy.judge import judge as measure_error
 from illumgrid.accuracy.judge import judge_walls as measure_walls
 from illumgrid.accuracy.probe import FEWEST_PATHS, MOST_PATHS
-from illumgrid.bake import Map, Progress, bake, enough_bounces, light_left_out
+from illumgrid.bake import Baked, Map, Progress, bake, enough_bounces, light_left_out
 from illumgrid.constants import PATHS
-from illumgrid.errors import BadInput, tell
+from illumgrid.errors import BadInput, tell, tell_after
 from illumgrid.field.lattice import specs_over
 from illumgrid.field.layers import layers_of
 from illumgrid.field.scene import Scene, level_table
@@ -25,7 +26,7 @@ from illumgrid.io.partial import Partial
 from illumgrid.light import Illumination
 from illumgrid.stages import Backend, Interpolator, Sampler
 from illumgrid.transport.stages import capabilities
-from illumgrid.transport.tracer import prepare
+from illumgrid.transport.tracer import Tracer, prepare
 
 
 def load(folder: str | os.PathLike[str]) -> Illumination:
@@ -109,12 +110,15 @@ def run(
     IllumgridWarning
         When the scene has no light, or nodes within the range are holes.
     """
-    if paths is not None and not 1 <= paths < 2**31:
-        raise BadInput(f"{paths} paths were asked for; expected at least 1 and fewer than 2**31")
-    if bounces is not None and not 0 <= bounces < 2**31:
-        raise BadInput(f"{bounces} bounces were asked for; expected 0 (light straight from the lamps) to 2**31 - 1")
-    if not 0 <= seed < 2**64:
-        raise BadInput(f"the seed is {seed}; expected a whole number from 0 to 2**64 - 1")
+    seed = _whole(seed, 0, 2**64, "the seed is {}; expected a whole number from 0 to 2**64 - 1")
+    if paths is not None:
+        paths = _whole(
+            paths, 1, 2**31, "{} paths were asked for; expected a whole number, at least 1 and fewer than 2**31"
+        )
+    if bounces is not None:
+        bounces = _whole(
+            bounces, 0, 2**31, "{} bounces were asked for; expected 0 (light straight from the lamps) to 2**31 - 1"
+        )
     levels = level_table(scene, 32 if isovalues is None else isovalues)
     options = {}
     if isovalues is not None and isinstance(sampler, str) and "count" in registry.option_names("sampler", sampler):
@@ -155,28 +159,15 @@ def run(
         scene, specs, levels, chosen[0], tracer, chosen[2],
         paths=walked, bounces=bounces, seed=seed, map=map, progress=progress, keep=keep,
     )  # fmt: skip
-    for field, holes in zip(scene.fields, baked.holes):
-        if holes:
-            tell(
-                "holes",
-                f"{holes} nodes within the range of field {field.name!r} got no light of their own (no normal, or no "
-                "sample in reach); they show that of the nearest node",
-                stacklevel=2,
-            )
+    _note_holes(scene, baked)
     recipe = {
         **{kind: _described(stage) for kind, stage in zip(("sampler", "backend", "interpolator"), chosen)},
         "grid": max(max(spec.shape) for spec in specs),
-        "paths": baked.paths,
         "bounces": bounces,
         "left_out": left_out,
         "isovalues": len(levels.table),
         "seed": seed,
-        "queries": baked.queries,
-        "texels": baked.texels,
-        "texel_paths": baked.texel_paths,
-        "holes": list(baked.holes),
-        "seconds": {stage: round(seconds, 3) for stage, seconds in baked.seconds.items()},
-        "relative_error": [grid.relative_error for grid in baked.grids],
+        **_measured(baked),
         "plan": asdict(plan) if isinstance(plan, Plan) else plan,
         "reached": None,
         "reached_uncertain": None,
@@ -184,10 +175,45 @@ def run(
         "versions": {name: version(name) for name in ("illumgrid", "numpy", "numba", "scipy")},
     }
     light = Illumination(scene, levels, baked.grids, baked.walls, recipe)
-    return judged(light, chosen[1]) if judge else light
+    return judged(light, chosen[1], tracer) if judge else light
 
 
-def judged(light: Illumination, backend: Backend) -> Illumination:
+def _whole(number: Any, least: int, limit: int, sentence: str) -> int:
+    """A whole number from `least` up to, not with, `limit`, of any integer type; or `BadInput`."""
+    try:
+        whole = operator.index(number)
+    except TypeError:
+        raise BadInput(sentence.format(repr(number))) from None
+    if not least <= whole < limit:
+        raise BadInput(sentence.format(whole))
+    return whole
+
+
+def _note_holes(scene: Scene, baked: Baked) -> None:
+    for field, holes in zip(scene.fields, baked.holes):
+        if holes:
+            tell_after(
+                "holes",
+                f"{holes} nodes within the range of field {field.name!r} got no light of their own (no normal, or no "
+                "sample in reach); they show that of the nearest node",
+                stacklevel=3,
+            )
+
+
+def _measured(baked: Baked) -> dict[str, Any]:
+    """What the recipe says about how the light came about."""
+    return {
+        "paths": baked.paths,
+        "queries": baked.queries,
+        "texels": baked.texels,
+        "texel_paths": baked.texel_paths,
+        "holes": list(baked.holes),
+        "seconds": {stage: round(seconds, 3) for stage, seconds in baked.seconds.items()},
+        "relative_error": [grid.relative_error for grid in baked.grids],
+    }
+
+
+def judged(light: Illumination, backend: Backend, tracer: Tracer | None = None) -> Illumination:
     """The same light with the error that it reached in its recipe; never raises.
 
     ``reached`` is the relative root mean square error at points that the run did not ask for, ``reached_uncertain`` its
@@ -200,19 +226,25 @@ def judged(light: Illumination, backend: Backend) -> Illumination:
         From `run`.
     backend : Backend
         The one that computed it.
+    tracer : Tracer, optional
+        That backend with the scene set up, if the caller still has it.
     """
     recipe = light.recipe
     try:
         can = capabilities(backend)
         if not can.transport or can.surface != "levelset":
             return light
-        tracer = prepare(registry.backend("auto"), light.scene)  # of the same surface, and quick
+        quick = registry.backend("auto")  # of the same surface
+        if tracer is None or quick != backend:
+            tracer = prepare(quick, light.scene)
         about = (recipe[key] for key in ("seed", "queries", "paths", "bounces"))
         found = measure_error(light.scene, tracer, light.grids, *about)
         texels = (recipe[key] for key in ("seed", "texels", "texel_paths", "bounces"))
         on_walls = measure_walls(light.scene, tracer, light.walls, *texels) if light.walls else None
     except Exception as reason:  # a finished run is worth more than its judgement
-        tell("error", f"the error reached could not be measured ({type(reason).__name__}: {reason})", stacklevel=2)
+        tell_after(
+            "error", f"the error reached could not be measured ({type(reason).__name__}: {reason})", stacklevel=2
+        )
         return light
     if found is None:
         return light

@@ -65,3 +65,13 @@ def tell(name: str, sentence: str, stacklevel: int = 1) -> None:
     """Warn under one of the names in `WARNINGS`; `stacklevel` counts from the caller."""
     assert name in WARNINGS
     warnings.warn(f"{name}: {sentence}", IllumgridWarning, stacklevel=stacklevel + 1)
+
+
+def tell_after(name: str, sentence: str, stacklevel: int = 1) -> None:
+    """As `tell`, about a finished result, which is kept: where warnings are errors, this one is only shown."""
+    try:
+        tell(name, sentence, stacklevel + 1)
+    except IllumgridWarning:
+        with warnings.catch_warnings():
+            warnings.simplefilter("always", IllumgridWarning)
+            tell(name, sentence, stacklevel + 1)

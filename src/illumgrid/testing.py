@@ -12,9 +12,11 @@ from typing import Any, ClassVar, cast
 
 import numpy as np
 
+from illumgrid.field.layers import layers_of
 from illumgrid.field.scene import Field, Material, Quad, Scene
 from illumgrid.field.volume import Floats, Volume, interpolate, outward_normals, world_to_index
 from illumgrid.grid import GridSpec, IlluminationGrid, Nodes
+from illumgrid.grid.channels import channels_of, mixed
 from illumgrid.registry.options import expected, options
 from illumgrid.stages import on_level_sets
 from illumgrid.transport.agreement import applies, judge, line, sidak
@@ -241,6 +243,14 @@ class BackendTests(_StageTests):
         assert not none.paths.any() and not none.mean.any() and not none.m2.any(), "no path gave light"
         assert np.isinf(self.solve(asked, 1).stderr).all(), "the error of a single path is not infinite"
 
+    def test_lights_add_up(self) -> None:
+        """Where the lights of the scene have channels of their own, their sum is the light of all."""
+        answer = self.solve(self.questions())
+        if len(answer.channels) > 3:
+            every = mixed(answer.channels, layers_of(_scene()), {}).rgb(answer.light)
+            off = np.abs(every - answer.mean).max()
+            assert off <= 1e-5 * answer.mean.max(), f"the sum of the lights is off that of all by {off:.1e}"
+
     def test_error_bars_are_honest(self) -> None:
         """Bars of 95 % cover at least 90 % of the references; their median is at most 1.5 times the true RMS error.
 
@@ -351,6 +361,19 @@ class InterpolatorTests(_StageTests):
         for name in ("values", "error", "support"):
             same = np.allclose(getattr(one, name), getattr(three, name), rtol=1e-6)
             assert same, f"samples of one channel give other {name} than samples of three equal channels"
+
+    def test_single_lights_are_filled_beside_all_light(self) -> None:
+        """They change nothing about the light of all, and a constant one is reproduced."""
+        samples, spec = _answers(lambda x: 1 + np.sin(x[:, :1]))
+        constant, rest = np.full_like(samples.mean, 0.25), samples.mean - np.float32(0.25)
+        light = np.concatenate([samples.mean, constant, rest], axis=1)
+        several = replace(samples, mean=light, m2=np.tile(samples.m2, 3), channels=channels_of(_scene()))
+        nodes = Nodes(spec, _scene().fields[0])
+        alone, together = (fill_nodes(self.make(), asked, nodes) for asked in (samples, several))
+        assert np.allclose(together.values, alone.values, rtol=1e-5), "single lights change the light of all"
+        if len(together.channels) > 3:
+            off = np.abs(together.light[..., 3:6] - 0.25).max()
+            assert off <= 1e-5, f"a constant single light is off by {off:.1e}"
 
     def test_the_order_of_samples_does_not_matter(self) -> None:
         """Up to rounding."""

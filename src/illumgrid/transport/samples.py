@@ -136,7 +136,14 @@ class Samples:
             channels = RGB
             if not any(array.strides[-1] for array in stored):  # the RGB views of grey light
                 stored, channels = (self.mean[:, :1], self.m2[:, :1]), GREY
-        channels = channels_for(self.mean.shape[-1]) if channels is None else channels
+        widths = {array.shape[-1] for array in stored}
+        if channels is None or (widths == {3} and channels.own == 3):  # a new `mean` knows the light of all only
+            channels = channels_for(self.mean.shape[-1])
+        if widths != {len(channels)}:
+            raise BadInput(
+                f"mean and m2 of {self.mean.shape[-1]} and {self.m2.shape[-1]} columns came with {len(channels)} "
+                "channels; expected one column for each"
+            )
         for names, array in zip((("light", "mean"), ("spread", "m2")), stored):
             shown = channels.rgb(array).view()
             shown.flags.writeable = False
