@@ -5,6 +5,7 @@ import pytest
 
 import illumgrid as ig
 from illumgrid.backends.reference import Reference
+from illumgrid.field import bricks
 from illumgrid.field.boundaries import suggest_magnitudes, suggest_range
 from illumgrid.field.coarse import block_means
 from illumgrid.field.diagnosis import critical_isovalues, diagnose, plateaus, turning
@@ -53,6 +54,15 @@ def test_the_light_is_the_same(lights):
         assert (one.support > 0).sum() > 500 and one.light.std() > 0.1
         for name in ("light", "error", "support"):
             assert np.array_equal(getattr(one, name), getattr(other, name))
+
+
+def test_the_light_is_the_same_in_the_large_bricks_of_large_fields(lights, monkeypatch):
+    monkeypatch.setattr(bricks, "LARGE", 0)
+    native = lights[0]
+    assert marchable(native.scene).shift.tolist() == [3] and marchable(native.scene).brick_shape.tolist() == [[2, 2, 2]]
+    large = ig.run(native.scene, grid=14, paths=4, bounces=2, isovalues=3)
+    assert np.array_equal(large.grids[0].light, native.grids[0].light)
+    assert np.array_equal(*(render(light, width=48, height=40, engine="software") for light in (large, native)))
 
 
 def test_pictures_and_pages_are_the_same(lights):

@@ -212,13 +212,19 @@ def cell_at(u, t, d, low, high):
 
 
 @inlined
-def cells_to_ask(bricks, brick, rank, c, end):
+def cells_to_ask(bricks, brick, rank, c, end, fine):
     """Cells of a brick, as bits, that rank high enough and lie between the cells of a ray's two ends."""
     left = at_least(bricks, brick, rank)
-    left &= BETWEEN[((min(c[0], end[0]) & 3) << 2) | (max(c[0], end[0]) & 3)]
-    left &= BETWEEN[16 | ((min(c[1], end[1]) & 3) << 2) | (max(c[1], end[1]) & 3)]
-    left &= BETWEEN[32 | ((min(c[2], end[2]) & 3) << 2) | (max(c[2], end[2]) & 3)]
+    left &= BETWEEN[((min(c[0], end[0]) >> fine & 3) << 2) | (max(c[0], end[0]) >> fine & 3)]
+    left &= BETWEEN[16 | ((min(c[1], end[1]) >> fine & 3) << 2) | (max(c[1], end[1]) >> fine & 3)]
+    left &= BETWEEN[32 | ((min(c[2], end[2]) >> fine & 3) << 2) | (max(c[2], end[2]) >> fine & 3)]
     return left
+
+
+@inlined
+def bit_of(c, fine):
+    """Number of the bit that stands for a cell in its brick: a cell of its own, or one for 2³ cells if `fine` is 1."""
+    return ((c[0] >> fine & 3) << 4) | ((c[1] >> fine & 3) << 2) | (c[2] >> fine & 3)
 
 
 @inlined
@@ -275,36 +281,29 @@ def enter_field(u, d, i, k, last, limit):
 
 
 @inlined
-def far_sides(b, ahead):
-    """Index coordinates of the planes through which a ray may leave brick b."""
-    return (
-        1.0 * ((b[0] + ahead[0]) << BRICK_SHIFT),
-        1.0 * ((b[1] + ahead[1]) << BRICK_SHIFT),
-        1.0 * ((b[2] + ahead[2]) << BRICK_SHIFT),
-    )
+def far_sides(b, ahead, shift):
+    """Index coordinates of the planes through which a ray may leave brick b, of 2^shift cells along each side."""
+    return 1.0 * ((b[0] + ahead[0]) << shift), 1.0 * ((b[1] + ahead[1]) << shift), 1.0 * ((b[2] + ahead[2]) << shift)
 
 
 @inlined
 def hit_in_brick(
-    values, sign, start, step_x, step_y, level, left, cell, u, d, i, k, ahead, toward, t, t_end, on_surface
+    values, sign, start, step_x, step_y, level, left, fine, c, u, d, i, k, ahead, toward, t, t_end, on_surface
 ):  # fmt: skip
-    """Follow a ray from cell to cell of a brick (Amanatides & Woo 1987), from `cell` at t on: (t, whether it hit).
+    """Follow a ray from cell to cell of a brick (Amanatides & Woo 1987), from cell c at t on: (t, whether it hit).
 
     The cubic is asked in the cells `left` only, given as bits, none of which lies beyond t_end.
     """
-    plane_x, plane_y, plane_z = 1.0 * (cell[0] + ahead[0]), 1.0 * (cell[1] + ahead[1]), 1.0 * (cell[2] + ahead[2])
-    at = ((cell[0] & 3) << 4) | ((cell[1] & 3) << 2) | (cell[2] & 3)
+    at = bit_of(c, fine)
     while left != 0:
-        sx, sy, sz = plane_x * i[0] + k[0], plane_y * i[1] + k[1], plane_z * i[2] + k[2]
+        sx, sy, sz = (c[0] + ahead[0]) * i[0] + k[0], (c[1] + ahead[1]) * i[1] + k[1], (c[2] + ahead[2]) * i[2] + k[2]
         t_cell = max(t, min(sx, sy, sz))
         bit = ONE << np.uint64(at)
         if left & bit != 0:
-            left ^= bit
-            lx, ly, lz = plane_x - ahead[0], plane_y - ahead[1], plane_z - ahead[2]
-            corner = start + int(lx) * step_x + int(ly) * step_y + int(lz)
-            ex = min(max(u[0] + t * d[0] - lx, 0.0), 1.0)
-            ey = min(max(u[1] + t * d[1] - ly, 0.0), 1.0)
-            ez = min(max(u[2] + t * d[2] - lz, 0.0), 1.0)
+            corner = start + c[0] * step_x + c[1] * step_y + c[2]
+            ex = min(max(u[0] + t * d[0] - c[0], 0.0), 1.0)
+            ey = min(max(u[1] + t * d[1] - c[1], 0.0), 1.0)
+            ez = min(max(u[2] + t * d[2] - c[2], 0.0), 1.0)
             root = root_in_cell(
                 values, sign, corner, step_x, step_y, level, ex, ey, ez, d[0], d[1], d[2], on_surface, t_cell - t
             )
@@ -315,25 +314,29 @@ def hit_in_brick(
         if t >= t_end:
             break
         on_x, on_y = first_of(sx, sy, sz)
-        plane_x += 1.0 * toward[0] if on_x else 0.0
-        plane_y += 1.0 * toward[1] if on_y else 0.0
-        plane_z += 0.0 if on_x or on_y else 1.0 * toward[2]
-        at += 16 * toward[0] if on_x else (4 * toward[1] if on_y else toward[2])
+        c = (
+            c[0] + (toward[0] if on_x else 0),
+            c[1] + (toward[1] if on_y else 0),
+            c[2] + (0 if on_x or on_y else toward[2]),
+        )
+        at = bit_of(c, fine)
+        left &= ~bit | (ONE << np.uint64(at))  # a bit is done with where the ray leaves what it stands for
     return t, False
 
 
 @inlined
-def leap(hop, b, far, u, d, i, k, toward, t):
+def leap(hop, b, shift, far, u, d, i, k, toward, t):
     """Leap over the cube of empty bricks that reaches `hop` bricks beyond b: (t, the brick behind it)."""
     end_x, end_y, end_z = b[0] + hop * toward[0], b[1] + hop * toward[1], b[2] + hop * toward[2]
-    tx = (far[0] + 4.0 * (hop * toward[0])) * i[0] + k[0]
-    ty = (far[1] + 4.0 * (hop * toward[1])) * i[1] + k[1]
-    tz = (far[2] + 4.0 * (hop * toward[2])) * i[2] + k[2]
+    side = 1.0 * (hop << shift)
+    tx = (far[0] + side * toward[0]) * i[0] + k[0]
+    ty = (far[1] + side * toward[1]) * i[1] + k[1]
+    tz = (far[2] + side * toward[2]) * i[2] + k[2]
     t = max(t, min(tx, ty, tz))
     by_x, by_y = first_of(tx, ty, tz)
-    mx = min(max(int(u[0] + t * d[0]) >> 2, min(b[0], end_x)), max(b[0], end_x))
-    my = min(max(int(u[1] + t * d[1]) >> 2, min(b[1], end_y)), max(b[1], end_y))
-    mz = min(max(int(u[2] + t * d[2]) >> 2, min(b[2], end_z)), max(b[2], end_z))
+    mx = min(max(int(u[0] + t * d[0]) >> shift, min(b[0], end_x)), max(b[0], end_x))
+    my = min(max(int(u[1] + t * d[1]) >> shift, min(b[1], end_y)), max(b[1], end_y))
+    mz = min(max(int(u[2] + t * d[2]) >> shift, min(b[2], end_z)), max(b[2], end_z))
     return t, (
         end_x + toward[0] if by_x else mx,
         end_y + toward[1] if by_y else my,
@@ -373,28 +376,28 @@ def march(scene, f, level, u, d, on_surface, limit):
     many_y, many_z = scene.brick_shape[f, 1], scene.brick_shape[f, 2]
     bricks = address(scene.bricks) + (scene.brick_start[f] << 7)
     octant = 64 + 8 * (4 * ahead[0] + 2 * ahead[1] + ahead[2])
-    rank = rank_of(scene.steps[f], level)
-    b = c[0] >> BRICK_SHIFT, c[1] >> BRICK_SHIFT, c[2] >> BRICK_SHIFT
+    rank, shift = rank_of(scene.steps[f], level), scene.shift[f]
+    b, fine, side = (c[0] >> shift, c[1] >> shift, c[2] >> shift), shift - BRICK_SHIFT, 1 << shift
     brick, beyond = ((b[0] * many_y + b[1]) * many_z + b[2]) << 7, (scene.brick_shape[f, 0] * many_y * many_z) << 7
     started = False
     while 0 <= brick < beyond:  # t_out ends the march before that, but for rounding; what follows reads raw memory
-        empty, far = count_below(bricks, brick + octant, rank), far_sides(b, ahead)
+        empty, far = count_below(bricks, brick + octant, rank), far_sides(b, ahead, shift)
         if empty == 8:
             return np.inf, MISS, -1
         if empty > 1:
-            t, b = leap(REACH[empty - 1] - 1, b, far, u, d, i, k, toward, t)
+            t, b = leap(REACH[empty - 1] - 1, b, shift, far, u, d, i, k, toward, t)
         else:
             tx, ty, tz = far[0] * i[0] + k[0], far[1] * i[1] + k[1], far[2] * i[2] + k[2]
             t_brick = min(tx, ty, tz)
             if empty == 0:
-                low = b[0] << BRICK_SHIFT, b[1] << BRICK_SHIFT, b[2] << BRICK_SHIFT
-                high = min(low[0] + 4, last[0]) - 1, min(low[1] + 4, last[1]) - 1, min(low[2] + 4, last[2]) - 1
+                low = b[0] << shift, b[1] << shift, b[2] << shift
+                high = min(low[0] + side, last[0]) - 1, min(low[1] + side, last[1]) - 1, min(low[2] + side, last[2]) - 1
                 if started:
                     c = cell_at(u, t, d, low, high)
-                left = cells_to_ask(bricks, brick, rank, c, cell_at(u, t_brick, d, low, high))
+                left = cells_to_ask(bricks, brick, rank, c, cell_at(u, t_brick, d, low, high), fine)
                 t, hit = hit_in_brick(
-                    scene.values, sign, start, step_x, step_y, level, left, c, u, d, i, k, ahead, toward,
-                    t, min(t_brick, t_out), on_surface,
+                    scene.values, sign, start, step_x, step_y, level, left, fine, c, u, d, i, k, ahead,
+                    toward, t, min(t_brick, t_out), on_surface,
                 )  # fmt: skip
                 if hit:
                     return (t, SURFACE, -1) if t < limit else (np.inf, MISS, -1)

@@ -10,11 +10,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from illumgrid.constants import BRICK, REACH
+from illumgrid.constants import BRICK, BRICK_SHIFT, REACH
 from illumgrid.field.volume import AT_ONCE, slabs
 
 RANKS = 255
 """Steps from the lowest rank to the highest."""
+
+LARGE = 1 << 28
+"""Voxels from which on a brick has twice as many cells along each side: its records then take an eighth of the memory,
+a quarter of a byte for each voxel."""
 
 Bytes = NDArray[np.uint8]
 
@@ -28,8 +32,9 @@ class Bricks(NamedTuple):
 
     steps: NDArray[np.float32]  # (RANKS,) ascending, filled up with inf
     shape: tuple[int, int, int]  # bricks along each axis
+    shift: int  # a brick has 2^shift cells along each side
     records: Bytes  # (bricks, 128) of each brick, in C order: first its cells, then its cubes towards the 8 octants
-    # cells: (BRICK³) in C order, the rank of the largest value at a cell's corners
+    # cells: (BRICK³) in C order, the rank of the largest value at the corners of a cell, in a large field of 2³ cells
     # cubes: (8, len(REACH)) the largest rank in the cube of so many bricks from here on; octants in C order, up is 1
 
 
@@ -39,24 +44,26 @@ def lay_bricks(values: NDArray[Any], sign: float = 1.0) -> Bricks:
     Slab by slab: beside the bricks nothing as large as the field is made.
     """
     steps = _steps(values, sign)
-    nx, ny, nz = (-(-int(n - 1) // BRICK) for n in values.shape)
+    shift = BRICK_SHIFT + (values.size >= LARGE)
+    side = 1 << shift
+    nx, ny, nz = (-(-int(n - 1) // side) for n in values.shape)
     shape = nx, ny, nz
     records = _aligned(nx * ny * nz, BRICK**3 + 8 * len(REACH))
     largest: Bytes = np.empty(shape, np.uint8)
     of_value = _ranks_of_all(values.dtype, steps, sign)
-    for bricks in slabs((nx, *values.shape[1:]), AT_ONCE // BRICK):
-        voxels = values[bricks.start * BRICK : bricks.stop * BRICK + 1]
+    for bricks in slabs((nx, *values.shape[1:]), AT_ONCE // side):
+        voxels = values[bricks.start * side : bricks.stop * side + 1]
         if of_value is None:
             turned = voxels if sign > 0 else -voxels
             ranks: Bytes = np.searchsorted(steps, turned.reshape(-1), side="right").astype(np.uint8)
         else:
             ranks = of_value[voxels.reshape(-1).view(f"u{voxels.itemsize}")]
-        cells = _cells(ranks.reshape(voxels.shape), (bricks.stop - bricks.start, ny, nz))
+        cells = _cells(ranks.reshape(voxels.shape), (bricks.stop - bricks.start, ny, nz), side // BRICK)
         at = slice(bricks.start * ny * nz, bricks.stop * ny * nz)
         records[at, : BRICK**3] = cells
         largest[bricks] = cells.max(axis=1).reshape(-1, ny, nz)
     _write_cubes(largest, records[:, BRICK**3 :].reshape(len(records), 8, len(REACH)))
-    return Bricks(steps, shape, records)
+    return Bricks(steps, shape, shift, records)
 
 
 def _ranks_of_all(kind: np.dtype[Any], steps: NDArray[np.float32], sign: float) -> Bytes | None:
@@ -67,12 +74,15 @@ def _ranks_of_all(kind: np.dtype[Any], steps: NDArray[np.float32], sign: float) 
     return np.searchsorted(steps, np.float32(sign) * numbers.astype(np.float32), side="right").astype(np.uint8)
 
 
-def _cells(ranks: Bytes, shape: tuple[int, int, int]) -> Bytes:
-    """Of each brick (m, BRICK³): the largest rank at the corners of its cells, 0 beyond the border."""
+def _cells(ranks: Bytes, shape: tuple[int, int, int], fine: int) -> Bytes:
+    """Of each brick (m, BRICK³): the largest rank at the corners of its fine³ cells each, 0 beyond the border."""
     for axis in range(3):
         line = np.moveaxis(ranks, axis, 0)
         ranks = np.moveaxis(np.maximum(line[:-1], line[1:]), 0, axis)
-    ranks = np.pad(ranks, [(0, m * BRICK - int(n)) for m, n in zip(shape, ranks.shape)])
+    ranks = np.pad(ranks, [(0, m * BRICK * fine - int(n)) for m, n in zip(shape, ranks.shape)])
+    for axis in range(3 if fine > 1 else 0):
+        line = np.moveaxis(ranks, axis, 0)
+        ranks = np.moveaxis(np.maximum(line[::2], line[1::2]), 0, axis)
     split = ranks.reshape(shape[0], BRICK, shape[1], BRICK, shape[2], BRICK)
     return np.ascontiguousarray(split.transpose(0, 2, 4, 1, 3, 5)).reshape(-1, BRICK**3)
 

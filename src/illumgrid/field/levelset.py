@@ -117,6 +117,7 @@ class Marchable(NamedTuple):
     bricks: NDArray[np.uint8]  # 128 bytes per brick, all fields concatenated
     brick_start: NDArray[np.int64]  # (F,) how many bricks come before
     brick_shape: NDArray[np.int64]  # (F, 3)
+    shift: NDArray[np.int64]  # (F,) a brick has 2^shift cells along each side
     albedo: Floats  # (F + Q, 3): fields, then quads
     emission: Floats  # (F + Q, 3)
     background: Floats  # (3,) constant radiance from all directions outside
@@ -178,6 +179,7 @@ def marchable(scene: Scene, channels: Sequence[Channel] = ALL) -> Marchable:
         bricks=records[0] if len(records) == 1 else np.concatenate(records),
         brick_start=np.cumsum([0, *(len(b.records) for b in bricks)], dtype=np.int64)[:-1],
         brick_shape=np.array([b.shape for b in bricks], dtype=np.int64),
+        shift=np.array([b.shift for b in bricks], dtype=np.int64),
         albedo=np.ascontiguousarray(np.array([material.albedo for material in materials])[:, colors]),
         **_quads_in_frame(scene, tables),
         **tables,
