@@ -20,6 +20,8 @@ from illumgrid.stages import Backend
 from illumgrid.transport.samples import Queries
 from illumgrid.transport.tracer import Tracer, prepare
 
+_SMALL = 1 << 26  # voxels
+
 
 def judge(
     scene: Scene, tracer: Tracer, grids: Sequence[IlluminationGrid], seed: int, queries: int, paths: int, bounces: int
@@ -59,11 +61,17 @@ def _reference(
 
 
 def remedies(scene: Scene, backend: Backend, specs: Sequence[GridSpec], bounces: int, seed: int) -> dict[str, float]:
-    """Relative error without noise of grids as they are, of `--grid` with twice the nodes, and of a smoothed field."""
-    soft = replace(scene, fields=tuple(replace(f, volume=smooth(f.volume, 1.0)) for f in scene.fields))
+    """Relative error without noise of grids as they are, of `--grid` with twice the nodes, and of a smoothed field.
+
+    A field of more than `_SMALL` voxels is not smoothed: the copy would be larger than all else of the run; infinite.
+    """
     longest = max(max(spec.shape) for spec in specs)
-    finer, found = specs_over(scene, 2 * longest), {}
-    for what, of, nodes in (("now", scene, specs), ("finer", scene, finer), ("smooth", soft, specs)):
+    tried = [("now", scene, specs), ("finer", scene, specs_over(scene, 2 * longest))]
+    if all(f.volume.values.size <= _SMALL for f in scene.fields):
+        soft = replace(scene, fields=tuple(replace(f, volume=smooth(f.volume, 1.0)) for f in scene.fields))
+        tried.append(("smooth", soft, specs))
+    found = {"smooth": np.inf}
+    for what, of, nodes in tried:
         try:  # few points and paths: a hint must not cost more than the run
             probe = Probe.start(of, prepare(backend, of), 512, 0.05, seed, most=128)
         except BadInput:  # no light where it looked

@@ -5,10 +5,11 @@ from numpy.typing import NDArray
 
 from illumgrid.bake import shifted_seed
 from illumgrid.field.scene import Field, Scene
-from illumgrid.field.volume import Floats, cell_gradient, index_to_world, interpolate, slabs
+from illumgrid.field.volume import AT_ONCE, Floats, cell_gradient, index_to_world, interpolate
 from illumgrid.stages import on_level_sets
 from illumgrid.transport.samples import Queries, join_queries
 
+_LOOKED_AT = 1 << 24  # voxels of a field of which all are looked at
 _STEPS = 64  # of the isovalue, within which points are uniform by area
 
 
@@ -36,7 +37,7 @@ def unseen_in_volume(scene: Scene, points: int, seed: int) -> Queries:
     found = []
     for number, field in enumerate(scene.fields):
         random = np.random.default_rng((other_paths(seed), 2, number))
-        cells, chance = _cells_by_step(field)
+        cells, chance = _cells_by_step(field, random)
         if not len(cells):
             continue
         upto = np.cumsum(chance)
@@ -62,24 +63,37 @@ def unseen_in_volume(scene: Scene, points: int, seed: int) -> Queries:
     return asked[np.flatnonzero(asked.normal.any(axis=1))]
 
 
-def _cells_by_step(field: Field) -> tuple[NDArray[np.int64], Floats]:
+def _cells_by_step(field: Field, random: np.random.Generator) -> tuple[NDArray[np.int64], Floats]:
     """Flat numbers (n,) of the voxel cells that the range crosses, and chances (n,) that give every step as many.
 
-    Chosen all alike, the few cells around a small level set would hardly be met.
+    Chosen all alike, the few cells around a small level set would hardly be met. Of a volume of more than `_LOOKED_AT`
+    voxels only some columns of cells are looked at.
     """
-    from scipy.ndimage import maximum_filter, minimum_filter
-
-    lowest, highest = map(float, field.stored_range)
-    step = np.empty(field.volume.shape, np.int8)
-    for slab in slabs(step.shape):
-        share = field.volume.values[slab].astype(np.float32, copy=False) - lowest
-        share *= _STEPS / (highest - lowest)
-        step[slab] = np.clip(np.floor(share, out=share), -1, _STEPS, out=share)
-    # Of the corners of each cell.
-    low, high = (of(step, 2, origin=-1)[:-1, :-1, :-1] for of in (minimum_filter, maximum_filter))
-    first, last = np.maximum(low, 0).reshape(-1), np.minimum(high, _STEPS - 1).reshape(-1)
-    cells = np.flatnonzero(first <= last)
-    first, last = first[cells], last[cells].astype(int) + 1
-    many = np.cumsum(np.bincount(first, minlength=_STEPS + 1) - np.bincount(last, minlength=_STEPS + 1))
-    rare = np.concatenate([[0.0], np.cumsum(1.0 / np.maximum(many, 1))])
+    nx, ny, nz = field.volume.shape
+    many, at_once = (nx - 1) * (ny - 1), max(1, AT_ONCE // (4 * nz))
+    columns = np.arange(many)
+    if field.volume.values.size > _LOOKED_AT:
+        columns = np.sort(random.choice(many, _LOOKED_AT // nz, replace=False))
+    parts = [_crossed(field, columns[first : first + at_once]) for first in range(0, len(columns), at_once)]
+    cells, first, last = (np.concatenate(each) for each in zip(*parts))
+    many_in = np.cumsum(np.bincount(first, minlength=_STEPS + 1) - np.bincount(last, minlength=_STEPS + 1))
+    rare = np.concatenate([[0.0], np.cumsum(1.0 / np.maximum(many_in, 1))])
     return cells, rare[last] - rare[first]
+
+
+def _crossed(
+    field: Field, columns: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """Of the cells in some columns along the last axis, those that the range crosses: number, first step, last + 1."""
+    (lowest, highest), (_, ny, nz) = map(float, field.stored_range), field.volume.shape
+    x, y = np.divmod(columns, ny - 1)
+    steps = []
+    for corner in np.ndindex(2, 2):
+        share = field.volume.values[x + corner[0], y + corner[1]].astype(np.float32, copy=False) - lowest
+        share *= _STEPS / (highest - lowest)
+        steps.append(np.clip(np.floor(share, out=share), -1, _STEPS, out=share).astype(np.int8))
+    low, high = (of.reduce(steps) for of in (np.minimum, np.maximum))
+    first = np.maximum(np.minimum(low[:, :-1], low[:, 1:]), 0)
+    last = np.minimum(np.maximum(high[:, :-1], high[:, 1:]), _STEPS - 1)
+    row, z = np.nonzero(first <= last)
+    return columns[row] * (nz - 1) + z, first[row, z].astype(int), last[row, z].astype(int) + 1

@@ -8,6 +8,7 @@ for: those whose surfaces are steep.
 
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,7 @@ from illumgrid.field.volume import UPWARD, Floats, Side, Volume, finite, histogr
 
 _VOXELS = 1 << 22  # that are looked at, in slabs spread over the volume
 _SLAB, _MARGIN = 16, 4  # slices of a slab, and of what the blur needs around it
+_SLABBED, _CUBE = 1 << 24, 48  # voxels beyond which cubes of this side are looked at
 _BLUR = 1.0  # voxels, against noise
 _FLAT = 0.003  # of the steepest slope: what is flatter is not looked at
 _STEEP = 0.05, 0.15  # of the slope of the steep boundaries: what is flatter is noise, without and with a background
@@ -177,19 +179,31 @@ def _in_units(volume: Volume, inside: Side, depth: Floats | list[float]) -> list
     return [float(x) for x in np.asarray(volume.in_units(low + share * (high - low)))]
 
 
-def _slabs(volume: Volume, inside: Side) -> list[tuple[NDArray[np.float32], slice]]:
-    """Blurred slabs along x, their values from 0 outside to 1 inside, and the slices that count."""
+def _parts_of(shape: tuple[int, int, int]) -> list[tuple[slice, ...]]:
+    """Slabs along x, all or some; beyond `_SLABBED` voxels, a cube in the middle of each of 4³ parts."""
+    every = max(1, int(np.ceil(np.prod(shape, dtype=float) / _VOXELS)))
+    if np.prod(shape, dtype=float) > _SLABBED:
+        middles = [[(2 * k + 1) * n // 8 for k in range(4)] for n in shape]
+        return [
+            tuple(slice(max(0, m - _CUBE // 2), min(n, m + _CUBE // 2)) for m, n in zip(at, shape))
+            for at in product(*middles)
+        ]
+    whole = slice(0, shape[1]), slice(0, shape[2])
+    return [(slice(first, min(first + _SLAB, shape[0])), *whole) for first in range(0, shape[0], _SLAB * every)]
+
+
+def _blurred(volume: Volume, inside: Side) -> list[tuple[NDArray[np.float32], tuple[slice, ...]]]:
+    """Blurred parts of a volume, their values from 0 outside to 1 inside, and the slices that count."""
     from scipy.ndimage import gaussian_filter
 
     v = volume.values
     low, high = (float(x) for x in volume.stored_extremes)
-    every = max(1, int(np.ceil(v.size / _VOXELS)))
     found = []
-    for first in range(0, v.shape[0], _SLAB * every):
-        begin = max(0, first - _MARGIN)
-        part = (v[begin : first + _SLAB + _MARGIN].astype(float) - low) / (high - low)
+    for block in _parts_of(volume.shape):
+        outer = tuple(slice(max(0, s.start - _MARGIN), s.stop + _MARGIN) for s in block)
+        part = (v[outer].astype(float) - low) / (high - low)
         part = part if UPWARD[inside] > 0 else 1 - part
-        counted = slice(first - begin, min(first + _SLAB, v.shape[0]) - begin)
+        counted = tuple(slice(s.start - o.start, s.stop - o.start) for s, o in zip(block, outer))
         found.append((gaussian_filter(part.astype(np.float32), _BLUR, mode="nearest"), counted))
     return found
 
@@ -202,7 +216,7 @@ def _boundary_voxels(volume: Volume, inside: Side) -> tuple[Floats, Floats]:
     sign, (low, high) = UPWARD[inside], (float(x) for x in volume.stored_extremes)
     threshold = (_otsu(counts, depth) - min(sign * low, sign * high)) / (high - low)
     ground, value, slope, step = [], [], [], volume.spacing / volume.spacing.min()
-    for part, counted in _slabs(volume, inside):
+    for part, counted in _blurred(volume, inside):
         gradient = np.stack(
             [np.gradient(part, np.float32(s), axis=a) if part.shape[a] > 1 else 0 * part for a, s in enumerate(step)]
         )

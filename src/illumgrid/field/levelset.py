@@ -2,12 +2,13 @@
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
 
 from illumgrid.errors import BadInput
-from illumgrid.field.bricks import lay_bricks
+from illumgrid.field.bricks import Bricks, lay_bricks
 from illumgrid.field.layers import ALL, Channel, light_tables
 from illumgrid.field.scene import Scene
 from illumgrid.field.volume import NATIVE, UPWARD, Floats, Side, Volume, index_to_world, slabs
@@ -158,13 +159,24 @@ def _together(volumes: Sequence[Volume]) -> tuple[NDArray[Any], NDArray[np.int64
     return together, np.array([first[id(volume.values)] for volume in volumes])
 
 
+_LAID: WeakKeyDictionary[Volume, dict[float, Bricks]] = WeakKeyDictionary()
+
+
+def _bricks_of(volume: Volume, sign: float) -> Bricks:
+    """Bricks of a volume, laid once for as long as it lives: bake, judgement and picture use the same."""
+    laid = _LAID.setdefault(volume, {})
+    if sign not in laid:
+        laid[sign] = lay_bricks(volume.values, sign)
+    return laid[sign]
+
+
 def marchable(scene: Scene, channels: Sequence[Channel] = ALL) -> Marchable:
     """Lay out a scene for marching. This takes time, so keep the result. A single volume is not copied.
 
     Albedos and lights have a column for each of `channels`, by default red, green and blue of all light together.
     """
     values, start = _together([f.volume for f in scene.fields])
-    bricks = [lay_bricks(f.volume.values, f.upward) for f in scene.fields]
+    bricks = [_bricks_of(f.volume, f.upward) for f in scene.fields]
     records = [b.records.reshape(-1) for b in bricks]
     materials = [f.material for f in scene.fields] + [q.material for q in scene.quads]
     colors, tables = [channel.color for channel in channels], light_tables(scene, channels)
