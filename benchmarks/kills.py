@@ -1,19 +1,21 @@
-"""Stops ``illumgrid run`` at random moments: ``python benchmarks/kills.py [--kills N] [--seconds S] [--seed N]``.
+"""Stops commands at random moments: ``python benchmarks/kills.py [--kills N] [--seconds S] [--seed N] [--only NAME]``.
 
-Each starts a run of a tiny volume in its own process and ends it by SIGKILL, SIGTERM or SIGHUP in turn, at a moment
-drawn uniformly from the run's duration. Half of the runs write to a new DIR, half, with ``--overwrite``, to one that
-holds a finished run. Most of a run is imports and light, which write nothing, so every other moment is drawn from the
-time of writing: it begins when the result appears in a hidden folder ``.DIR-...`` beside DIR, and lasts as long as in
-an uninterrupted run.
+Each command that writes works on a tiny volume, or on its finished run, in its own process and is ended by SIGKILL,
+SIGTERM, SIGHUP or SIGINT in turn, at a moment drawn uniformly from its duration. Every other time what it writes is
+there already, from an earlier run with other options, where the command may replace it. Most of the time goes into
+imports and light, which write nothing, so every other moment is drawn from the time of writing: it begins when a hidden
+folder ``.NAME-...`` appears beside the result.
 
-Afterwards DIR must be absent or complete (it is read back and compared with the result of its seed; with
-``--overwrite`` the old result counts as complete), only after SIGKILL may hidden folders lie beside it, and the next
-run into the same DIR must work and remove them. Between the two renames of ``--overwrite``, DIR is absent and both
-results are complete in the hidden folder, from which the next run puts the old one back; the summary counts this
-case. The exit code is 1 if anything else is found.
+Afterwards the result must be absent, the old one, or the new one, each complete: equal to that of an uninterrupted
+command, byte for byte (a run: light for light; what tells of seconds: readable). Only after SIGKILL may anything else
+lie beside it, and the next command to the same place must work and remove it. Between the two renames of
+``run --overwrite`` the folder is absent and both results are complete in the hidden folder, from which the next run
+puts the old one back; the summary counts this case. The exit code is 1 if anything else is found.
 """
 
 import argparse
+import json
+import os
 import random
 import shutil
 import signal
@@ -22,142 +24,238 @@ import sys
 import tempfile
 import time
 from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 import illumgrid as ig
 
-OLD, NEW = 1, 2  # seeds of the existing result and of the one being written
-OPTIONS = ("--range", "0.3", "0.9", "--grid", "24", "--paths", "4", "--threads", "1")
-STEP = 0.0002  # seconds between polls
+STEP = 0.0005  # seconds between polls
+SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGHUP, signal.SIGINT)
+RUN = ("run", "v.npy", "--range", "0.3", "0.9", "--grid", "24", "--paths", "4", "--threads", "1", "-o", "out")
+KEPT = {"v.npy", "light", "points.csv", "temporary"}
 
 
-def start(folder, seed, overwrite=False):
-    command = [sys.executable, "-m", "illumgrid", "run", "v.npy", *OPTIONS, "-o", "out", "--seed", str(seed)]
-    if overwrite or (folder / "out").exists():
-        command.append("--overwrite")
-    return subprocess.Popen(command, cwd=folder, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+@dataclass(frozen=True)
+class Command:
+    """What is stopped: its arguments, with {} for what tells an old result from a new one; and what it writes."""
+
+    arguments: tuple[str, ...]
+    writes: str | None = None
+    old: str = "1"
+    new: str = "2"
+    replaces: bool = True
+    same: Callable[[Path, Path], bool] | None = None
+    """Compares two results, by default their bytes."""
 
 
-def hidden(folder, prefix=".out-"):
-    return [p for p in folder.iterdir() if p.name.startswith(prefix)]
+def one_light(a, b):
+    """Whether two folders are whole and hold one light."""
+    last = {"moments.npz"}  # for more paths; written into a finished folder
+    if {p.name for p in a.iterdir()} - last != {p.name for p in b.iterdir()} - last:
+        return False
+    return all(
+        np.array_equal(x.values, y.values) for x, y in zip(ig.load(a).grids, ig.load(b).grids, strict=True)
+    )  # with its checksum
+
+
+def readable(a, b):
+    """Whether a folder of `bench` is whole: its files are there, and not cut."""
+    json.loads((a / "bench.json").read_text("utf-8"))
+    ends = {".png": b"IEND\xaeB`\x82", ".svg": b"</svg>\n"}
+    return {p.name for p in a.iterdir()} == {p.name for p in b.iterdir()} and all(
+        p.read_bytes().endswith(ends[p.suffix]) for p in a.iterdir() if p.suffix in ends
+    )
+
+
+def bytes_of(path):
+    """All bytes below a path."""
+    files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
+    return [(p.relative_to(path).as_posix(), p.read_bytes()) for p in files]
+
+
+def _export(ending, *more):
+    return Command(("export", "light", f"a.{ending}", *more), f"a.{ending}")
+
+
+SURFACE = ("--isovalue", "0.{}")
+COMMANDS = {
+    "run": Command((*RUN, "--seed", "{}", "--overwrite"), "out", same=one_light),
+    "preview": Command(
+        ("preview", "light", "--engine", "software", "--exposure", "{}", "--output", "a.png", "--size", "300", "300"),
+        "a.png",
+    ),
+    "sweep": Command(
+        ("preview", "light", "--engine", "software", "--exposure", "{}", "--sweep", "3", "a.gif", "--size", "99", "99"),
+        "a.gif",
+    ),
+    "view": Command(("view", "light", "--export", "a.html", "--light", "key=0.{}"), "a.html"),
+    **{f"export .{e}": _export(e, "--light", "key=0.{}") for e in ("vti", "exr", "npz")},
+    "export .nrrd": _export("nrrd", "--on", "field", "--light", "key=0.{}"),
+    **{f"export .{e}": _export(e, "--isovalue", "0.{}") for e in ("glb", "ply")},
+    "density": Command(
+        ("density", "points.csv", "--spacing", "0.1", "--sigma", "0.{}", "-o", "a.nrrd"), "a.nrrd", old="3", new="2"
+    ),
+    "plugins --new": Command(("plugins", "--new", "mine", "sampler", "mine"), "mine", replaces=False),
+    "bench": Command(
+        ("bench", "v.npy", "--range", "0.3", "0.9", "--budget", "2", "-o", "b"), "b", replaces=False, same=readable
+    ),
+    "info": Command(("info", "v.npy")),
+    "verify": Command(("verify", "--paths", "500", "--backend", "numba")),
+}
+
+
+def start(folder, command, which):
+    text = [part.format(which) for part in command.arguments]
+    environment = {**os.environ, "TMPDIR": str(folder / "temporary")}
+    run = [sys.executable, "-m", "illumgrid", *text]
+    return subprocess.Popen(run, cwd=folder, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+
+
+def hidden(folder):
+    return [p for p in folder.iterdir() if p.name.startswith(".")]
 
 
 def writing(folder, process):
     """Wait until the process has begun to write, or has ended."""
-    while not any((p / "new").is_dir() for p in hidden(folder)) and process.poll() is None:
+    while process.poll() is None and not any(any(p.iterdir()) for p in hidden(folder) if p.is_dir()):
         time.sleep(STEP)
 
 
-def durations(folder):
-    """Seconds from start to writing, of writing, and from there to the end, for an uninterrupted run."""
+@dataclass
+class Known:
+    """What uninterrupted commands take and give."""
+
+    before: float
+    during: float
+    new: Path | None
+    old: Path | None = None
+
+
+def learn(work, name, command, which):
+    """Run a command without a stop."""
+    folder = place(work, f"{name} {which}")
     begun = time.perf_counter()
-    process = start(folder, OLD)
+    process = start(folder, command, getattr(command, which))
     writing(folder, process)
     at = time.perf_counter()
-    while hidden(folder):
-        time.sleep(STEP)
-    over = time.perf_counter()
-    assert process.wait() == 0
-    return at - begun, over - at, time.perf_counter() - over
+    assert process.wait() == 0, (name, which)
+    result = folder / command.writes if command.writes else None
+    return Known(at - begun, time.perf_counter() - at, result)
 
 
-def same(out, light):
-    """Whether DIR is complete: it can be read, with its checksum, and holds this light."""
-    back = ig.load(out)
-    return all(np.array_equal(a.values, b.values) for a, b in zip(back.grids, light.grids, strict=True))
+def place(work, name):
+    """Make a folder with what commands read."""
+    folder = work / name.replace("/", "-")
+    folder.mkdir()
+    (folder / "temporary").mkdir()
+    for source in (work / "first").iterdir():
+        if source.name in KEPT and source.name != "temporary":
+            (shutil.copytree if source.is_dir() else shutil.copy)(source, folder / source.name)
+    return folder
 
 
-def whole(out, lights):
-    """Seed of the result in DIR, None if DIR is absent; raises for anything else."""
-    if not out.exists():
+def state(folder, command, known):
+    """Whether the result is absent (None), the old one, or the new one; raises for anything else."""
+    result = folder / command.writes if command.writes else None
+    if result is None or not result.exists():
         return None
-    found = [seed for seed, light in lights.items() if same(out, light)]
-    assert len(found) == 1, found
-    must, may = {"illumination.exr", "run.json", "preview.png"}, {"moments.npz"}  # the last to be written
-    assert must <= {p.name for p in out.iterdir()} <= must | may
+    same = command.same or (lambda a, b: bytes_of(a) == bytes_of(b))
+    found = [which for which in ("new", "old") if getattr(known, which) and same(result, getattr(known, which))]
+    assert found, f"{result.name} is neither the old nor the new result"
     return found[0]
 
 
-def kill(folder, finished, lights, chance, durations, late, signals):
-    """Kill one run and classify what it left."""
-    out = folder / "out"
+def stop(folder, command, known, finished, late, signals, chance):
+    """Stop one command and name what it left."""
     if finished:
-        shutil.copytree(finished, out)
-    before, during, after = durations
-    process = start(folder, NEW)
+        target = folder / command.writes
+        (shutil.copytree if known.old.is_dir() else shutil.copy)(known.old, target)
+    process = start(folder, command, command.new)
     if late:
         writing(folder, process)
-        time.sleep(chance.uniform(0, during))
+        time.sleep(chance.uniform(0, known.during))
     else:
-        time.sleep(chance.uniform(0, before + during + after))
+        time.sleep(chance.uniform(0, known.before + known.during))
     process.send_signal(signals)
+    asked = time.perf_counter()
     ended = process.wait()
-    seed, left = whole(out, lights), hidden(folder, ".")
-    unexpected = {p.name for p in folder.iterdir()} - {"v.npy", "out", *(p.name for p in left)}
-    assert not unexpected, unexpected
+    took = time.perf_counter() - asked
+    at, left = state(folder, command, known), hidden(folder)
+    beside = {p.name for p in folder.iterdir()} - KEPT - {command.writes} - {p.name for p in left}
+    rest = [p.name for p in (folder / "temporary").iterdir()]
+    assert beside <= {"out.partial"}, beside  # which the next run goes on with
+    found = {None: "absent", "old": "the old result", "new": "the new result"}[at]
+    if command.writes is None:
+        found = "nothing written"
     if ended == 0:
-        found = "ended before the kill"
-        assert seed == NEW
-    elif seed is None and finished:
+        found = "ended before the stop"
+        assert at == "new" or command.writes is None
+    elif at is None and finished:
         found = "absent between two renames, both results complete beside it"
-        (place,) = left
-        assert whole(place / "old", lights) == OLD and whole(place / "new", lights) == NEW
-    else:
-        found = {None: "absent", OLD: "the old result, complete", NEW: "the new result, complete"}[seed]
-        assert seed in ((OLD, NEW) if finished else (None, NEW))
-    if left:
-        found += ", a hidden folder left beside it"
+        (hide,) = left
+        assert one_light(hide / "old", known.old) and one_light(hide / "new", known.new)
+    elif signals != signal.SIGKILL:
+        assert ended == 130, f"exit {ended}"
     if signals != signal.SIGKILL:
-        assert not left, left
-    again = start(folder, NEW, overwrite=finished is not None)  # which puts back what was moved aside
-    assert again.wait() == 0 and whole(out, lights) == NEW
-    assert not hidden(folder, "."), "a folder of a dead process"
-    return found
+        assert not left and not rest, (left, rest)
+    elif left or rest:
+        found += ", a hidden folder beside it"
+    if (left or rest) and (at is None or command.replaces):  # the next command removes it
+        again = start(folder, command, command.new)
+        assert again.wait() == 0 and (command.writes is None or state(folder, command, known) == "new")
+        assert not hidden(folder) and not any((folder / "temporary").iterdir()), "what a dead process left is there"
+    return found, took
 
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--kills", type=int, default=100)
-    parser.add_argument("--seconds", type=float, default=float("inf"), help="begin no kill after so long")
+    parser.add_argument("--kills", type=int, default=200)
+    parser.add_argument("--seconds", type=float, default=float("inf"), help="begin no stop after so long")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--only", help="name of a command")
     asked = parser.parse_args()
     until = time.monotonic() + asked.seconds
-    chance, tally, wrong = random.Random(asked.seed), Counter(), 0
-    with tempfile.TemporaryDirectory() as work:
-        place = Path(work) / "first"
-        place.mkdir()
+    chance, tally, wrong, slowest = random.Random(asked.seed), Counter(), 0, 0.0
+    commands = {name: c for name, c in COMMANDS.items() if asked.only in (None, name)}
+    with tempfile.TemporaryDirectory() as name:
+        work = Path(name)
+        (work / "first" / "temporary").mkdir(parents=True)
         x = np.indices((24, 24, 24)).reshape(3, -1).T / 11.5 - 1
-        np.save(place / "v.npy", (1.2 - np.linalg.norm(x, axis=1)).reshape(24, 24, 24))
-        durations(place)  # compiles
-        lights = {}
-        for seed in (NEW, OLD):
-            assert start(place, seed).wait() == 0
-            lights[seed] = ig.load(place / "out")
-        shutil.copytree(place / "out", place / "kept")
-        times = durations(place)
-        before, during, after = times
-        print(f"a run takes {before:.2f} s before, {during:.3f} s during and {after:.2f} s after writing", flush=True)
+        np.save(work / "first" / "v.npy", (1.2 - np.linalg.norm(x, axis=1)).reshape(24, 24, 24))
+        points = np.random.default_rng(0).random((3000, 3))
+        np.savetxt(work / "first" / "points.csv", points, "%.6f", ",", header="x,y,z", comments="")
+        assert start(work / "first", Command((*RUN, "--seed", "0")), "").wait() == 0  # compiles
+        (work / "first" / "out").rename(work / "first" / "light")
+        known = {}
         for number in range(asked.kills):
             if time.monotonic() > until:
                 break
-            over, late = number % 2 == 1, number // 2 % 2 == 1
-            signals = (signal.SIGKILL, signal.SIGTERM, signal.SIGHUP)[number % 3]
-            folder = Path(work) / str(number)
-            folder.mkdir()
-            shutil.copy(place / "v.npy", folder)
+            at = list(commands)[number % len(commands)]
+            command, turn = commands[at], number // len(commands)
+            finished = bool(command.writes) and command.replaces and turn % 2 == 1
+            if at not in known:
+                known[at] = learn(work, at, command, "new")
+            if finished and known[at].old is None:
+                known[at].old = learn(work, at, command, "old").new
+            signals = SIGNALS[(number + turn) % len(SIGNALS)]
+            folder = place(work, str(number))
             try:
-                found = kill(folder, place / "kept" if over else None, lights, chance, times, late, signals)
-            except (AssertionError, ig.BadInput) as trouble:
-                found, wrong = f"WRONG: {trouble}", wrong + 1
-            found = f"{signals.name}: {found}"
-            tally[("with --overwrite: " if over else "to a new DIR: ") + found] += 1
+                late = bool(command.writes) and turn // 2 % 2 == 1
+                found, took = stop(folder, command, known[at], finished, late, signals, chance)
+                slowest = max(slowest, took)
+            except (AssertionError, OSError, ValueError) as trouble:
+                found, wrong = f"WRONG: {type(trouble).__name__} {trouble}", wrong + 1
+                print(f"{number} {at} {signals.name}: {found}", flush=True)
+            tally[f"{signals.name}: {found}"] += 1
             shutil.rmtree(folder)
             if number % 10 == 9:
-                print(f"{number + 1} kills", flush=True)
+                print(f"{number + 1} stops, {wrong} wrong", flush=True)
     for found, count in sorted(tally.items()):
         print(f"{count:4}  {found}")
+    print(f"{sum(tally.values())} stops of {len(commands)} commands, {wrong} wrong; the slowest took {slowest:.2f} s")
     raise SystemExit(wrong > 0)
 
 

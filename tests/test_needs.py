@@ -2,12 +2,15 @@
 
 import re
 
+import numpy as np
 import pytest
 
 import illumgrid as ig
 from illumgrid.errors import BadInput
 from illumgrid.field.lattice import specs_over
-from illumgrid.field.scene import Scene, level_table
+from illumgrid.field.scene import Field, Scene, level_table
+from illumgrid.field.volume import Volume
+from illumgrid.grid import channels_of
 from illumgrid.io import exports, needs
 from shapes import ball, lit, sky
 
@@ -38,6 +41,34 @@ def test_nodes_that_no_isosurface_of_the_range_meets_take_little():
     scene = Scene.sky(ball(20), range=(0.5, 0.52))
     wide = Scene.sky(ball(20), range=(0.05, 0.95))
     assert needs._share(scene.fields[0]) < 0.2 * needs._share(wide.fields[0])
+
+
+def test_a_denser_grid_and_layers_of_light_are_counted(free):
+    scene = Scene.studio(ball(10)).in_harmonics(2)
+    specs, levels = specs_over(scene, 40), level_table(scene, 2)
+    needed = {}
+    for density in (1, 2):
+        free(0)
+        with pytest.raises(BadInput) as reason:
+            needs.check_run(scene, specs, levels, density)
+        needed[density] = float(re.search(r"needs ([\d.]+) GB", str(reason.value))[1])
+    layers = len(channels_of(scene))
+    values = 4 * 40**3 * layers * (2**3 - 1)  # single precision, at eight times the nodes
+    assert layers >= 9 and needed[2] - needed[1] > values / 1e9
+
+
+def test_an_isosurface_beyond_memory_is_refused_before_it_is_extracted(free, tmp_path):
+    noise = Field("noise", Volume(np.random.default_rng(0).random((33, 20, 7))), range=(0.2, 0.8))
+    crossed = sum(int((np.diff(noise.volume.values > 0.5, axis=axis)).sum()) for axis in range(3))
+    free(needs._CROSSING * crossed + needs.TO_EXTRACT * noise.volume.values.size)
+    needs.check_surface(noise, 0.5, "")
+    free(needs._CROSSING * crossed)
+    with pytest.raises(BadInput, match=r"the surface needs"):
+        needs.check_surface(noise, 0.5, "")
+    light = lit(sky())
+    free(1000)
+    with pytest.raises(BadInput, match=r"the surface needs .* smooth the volume"):
+        exports.write(light, tmp_path / "a.ply")
 
 
 def test_the_library_info_and_export_refuse_as_well(refuse, tmp_path, free):

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from illumgrid import cli
+from illumgrid.backends.mesh import bvh
 from illumgrid.backends.numba_ import Numba
 from illumgrid.bake import Bake, wall_queries
 from illumgrid.field.scene import Scene, level_table
@@ -47,6 +48,41 @@ def test_ctrl_c_ends_a_chunk_and_does_not_wait_for_its_paths(box, threads, monke
     with pytest.raises(KeyboardInterrupt):
         tracer.solve(queries[:16], paths=range(1 << 16), bounces=100_000, seed=0)
     assert stops and all(stop == 1 and not paths.all() for stop, paths in stops)
+
+
+def test_ctrl_c_does_not_wait_for_compilation(box, monkeypatch):
+    scene, queries = box
+    from illumgrid.backends import kernels
+
+    begun, over = threading.Event(), threading.Event()
+
+    def compiling(*_):
+        begun.set()
+        over.wait()
+
+    compiling.signatures = []
+    monkeypatch.setattr(kernels, "solve_queries", compiling)
+    threading.Thread(target=lambda: begun.wait() and os.kill(os.getpid(), signal.SIGINT)).start()
+    with pytest.raises(KeyboardInterrupt):
+        prepare(Numba(threads=1), scene).solve(queries[:4], paths=range(1), bounces=1, seed=0)
+    over.set()
+
+
+def test_ctrl_c_ends_the_building_of_a_tree(monkeypatch):
+    faces = np.arange(3 * 40).reshape(-1, 3)
+    real, ended = bvh.grow, []
+
+    def growing(bounds, order, halt):
+        threading.Timer(0.05, os.kill, (os.getpid(), signal.SIGINT)).start()
+        while not halt[0]:
+            time.sleep(0.001)
+        ended.append([len(part) for part in real(bounds, order, halt)])  # no node is made any more
+        return real(bounds, order, np.zeros(1, np.uint8))
+
+    monkeypatch.setattr(bvh, "grow", growing)
+    with pytest.raises(KeyboardInterrupt):
+        bvh.build(np.random.default_rng(0).random((120, 3)), faces)
+    assert ended == [[1, 1, 1]]
 
 
 def test_a_batch_shows_progress_within_it(box):

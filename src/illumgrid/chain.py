@@ -146,7 +146,7 @@ def run(
     if not _shines(scene):
         tell("dark", "no background, lamp or surface of this scene emits light: all of it will be 0", stacklevel=2)
     specs = specs_over(scene, grid)
-    needs.check_run(scene, specs, levels)
+    needs.check_run(scene, specs, levels, getattr(chosen[2], "density", 1.0))
     if bounces is None:
         bounces, left_out = enough_bounces(scene, tracer, seed)
     elif not before:

@@ -1,6 +1,7 @@
 """Light transport by compiled kernels: they march the trilinear level set, or cast rays at its mesh."""
 
 import os
+import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
@@ -121,7 +122,7 @@ class NumbaTracer:
         )
         first = next(pieces)
         if not compiled(solve_queries, first[0]):
-            chunk(first[0], first[1][:0])  # in the caller's thread: Ctrl-C ends a compilation only there
+            beside(lambda: chunk(first[0], first[1][:0]))
         share(self.threads, chunk, chain([first], pieces), stop)
         return answer
 
@@ -134,6 +135,23 @@ class NumbaTracer:
 
         for row, members in row_groups(self.scene, level):
             yield meshed(self.fields, self.meshes.of(row)), members
+
+
+def beside(work: Callable[[], None]) -> None:
+    """Do work that cannot be stopped, such as compilation, in another thread; Ctrl-C ends only the wait for it."""
+    trouble: list[BaseException] = []
+
+    def do() -> None:
+        try:
+            work()
+        except BaseException as problem:
+            trouble.append(problem)
+
+    thread = threading.Thread(target=do, daemon=True)  # at the end of the process it is not waited for
+    thread.start()
+    thread.join()
+    if trouble:
+        raise trouble[0]
 
 
 def compiled(kernel: Any, surfaces: Any) -> bool:

@@ -1,10 +1,12 @@
 """The command line: one file per command; only here does the package print."""
 
 import io
+import os
 import re
 import signal
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Annotated, Any
 
 import typer
@@ -62,6 +64,11 @@ def main() -> None:
     code = guarded(lambda: app(standalone_mode=False))
     for number in stops:  # nothing is left but the end of the threads
         signal.signal(number, signal.SIG_IGN)
+    if code == 130:  # threads may be at work in what does not stop, such as compilation: nobody waits for them
+        for stream in (sys.stdout, sys.stderr):
+            with suppress(OSError, ValueError):
+                stream.flush()
+        os._exit(code)
     sys.exit(code)
 
 

@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from math import prod
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from illumgrid.errors import BadInput
 from illumgrid.field.lattice import GridSpec
 from illumgrid.grid import channels_of
@@ -23,6 +25,10 @@ TO_EXPORT = 75
 """Bytes a point for all arrays in one file."""
 TO_DEPOSIT = 18
 """Bytes a voxel for the density of points."""
+TO_EXTRACT = 16
+"""Bytes a voxel for the extraction of an isosurface."""
+_CROSSING = 270
+"""Bytes, in a file of an isosurface, for each edge between voxels that it crosses."""
 _QUERY, _CHANNEL = 300, 20
 """Bytes a query, and for each channel of its answer."""
 _SOME = 50_000
@@ -35,14 +41,18 @@ def check(what: str, need: float, todo: str) -> None:
         raise BadInput(f"{what} needs {gigabytes(int(need))} of memory, {gigabytes(free)} are free; {todo}")
 
 
-def check_run(scene: "Scene", specs: Sequence[GridSpec], levels: "Levels") -> None:
-    """Refuse a run whose nodes, walls and fields do not fit, and say which grid would."""
+def check_run(scene: "Scene", specs: Sequence[GridSpec], levels: "Levels", density: float = 1.0) -> None:
+    """Refuse a run whose nodes, walls and fields do not fit, and say which grid would.
+
+    The interpolator stores `density` times the nodes along each axis.
+    """
     channels = len(channels_of(scene))
     each = _QUERY + _CHANNEL * channels
     fixed = sum(TO_LIGHT * prod(field.volume.shape) for field in scene.fields)
     fixed += each * len(levels.table) * sum(prod(quad.texels) for quad in scene.quads)
     nodes = sum(
-        prod(spec.shape) * (8 * (channels + 1) + each * _share(field)) for spec, field in zip(specs, scene.fields)
+        prod(spec.shape) * (8 * (channels + 1) * density**3 + each * _share(field))
+        for spec, field in zip(specs, scene.fields)
     )
     longest, room = max(max(spec.shape) for spec in specs), 0.8 * free_memory() - fixed
     fits = int(longest * (max(room, 0.0) / nodes) ** (1 / 3))
@@ -50,6 +60,17 @@ def check_run(scene: "Scene", specs: Sequence[GridSpec], levels: "Levels") -> No
     if fits >= 8:
         todo = f"grid={fits} would need {gigabytes(int(fixed + nodes * (fits / longest) ** 3))}"
     check("the run", fixed + nodes, todo)
+
+
+def check_surface(field: "Field", isovalue: float, todo: str) -> None:
+    """Refuse the extraction of an isosurface whose triangles do not fit; counts what it crosses."""
+    values, level = field.volume.values, float(field.volume.to_stored(isovalue))
+    crossed = 0
+    for k in range(0, len(values), 16):  # some slices at a time: what is compared takes memory, too
+        above = values[k : k + 17] >= level
+        for axis, part in enumerate((above, above[:16], above[:16])):
+            crossed += int(np.count_nonzero(np.diff(part, axis=axis)))
+    check("the surface", TO_EXTRACT * values.size + _CROSSING * crossed, todo)
 
 
 def _share(field: "Field") -> float:

@@ -3,6 +3,7 @@
 One ray goes down the tree at a time and meets eight boxes or eight triangles at once (`simd`).
 """
 
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import numba
@@ -149,14 +150,17 @@ def split(bounds, order, start, stop):
 
 
 @jit
-def grow(bounds, order):
-    """Binary tree over triangles: (child (m, 2), span (m, 2) in order, box (m, 6)); a leaf has child -1."""
+def grow(bounds, order, halt):
+    """Binary tree over triangles: (child (m, 2), span (m, 2) in order, box (m, 6)); a leaf has child -1.
+
+    Set from another thread, `halt` (1,) ends it early.
+    """
     most = 2 * order.shape[0]
     child, span, box = np.full((most, 2), -1, np.int64), np.zeros((most, 2), np.int64), np.empty((most, 6))
     nothing(box)
     span[0, 1] = order.shape[0]
     made, node = 1, 0
-    while node < made:
+    while node < made and not halt[0]:
         start, stop = span[node]
         for m in range(start, stop):
             enclose(box[node], bounds[order[m]])
@@ -170,7 +174,7 @@ def grow(bounds, order):
 
 
 @jit
-def collapse(child, box):
+def collapse(child, box, halt):
     """Make a binary tree eight-wide: the binary nodes (n, 8) that are children of each wide one, -1 for none.
 
     By dynamic programming over the surface area heuristic: Ylitie, Karras & Laine, "Efficient incoherent ray
@@ -180,6 +184,8 @@ def collapse(child, box):
     # cost[n, i]: of the subtree n under at most i roots; left[n, i]: how many of them lie in its first half.
     cost, left = np.full((count, WIDE + 1), np.inf), np.zeros((count, WIDE + 1), np.int64)
     for n in range(count - 1, -1, -1):
+        if halt[0]:
+            return np.full((1, WIDE), -1, np.int64), np.int64(1)
         first, second = child[n]
         if first < 0:
             cost[n, 1:] = half_area(box[n])
@@ -278,8 +284,18 @@ def build(vertices: ArrayLike, faces: ArrayLike) -> Tree:
     triangles = ((corners - centre) * scale).astype(np.float32)
     bounds = np.concatenate([triangles.min(axis=1), triangles.max(axis=1)], axis=1)
     order = np.arange(len(triangles))
-    child, span, box = grow(bounds, order)
-    wide, depth = collapse(child, box)
+    halt = np.zeros(1, np.uint8)
+
+    def work() -> tuple[Any, ...]:
+        child, span, box = grow(bounds, order, halt)
+        return child, span, box, *collapse(child, box, halt)
+
+    with ThreadPoolExecutor(1) as other:  # this one waits for Ctrl-C
+        try:
+            child, span, box, wide, depth = other.submit(work).result()
+        except BaseException:
+            halt[0] = 1
+            raise
     leaves = int(np.count_nonzero(child[:, 0] < 0))
     memory = aligned(len(wide) * NODE + leaves * LEAF, np.float32)
     fill(memory, memory.view(np.int32), triangles, order, child, span, box, wide)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from illumgrid.errors import BadInput, shown, shown_range
 from illumgrid.field.levelset import isosurface
 from illumgrid.field.onto import onto_levels
+from illumgrid.io import needs
 from illumgrid.io.exports.arrays import display_linear
 from illumgrid.io.readers.mesh import Y_UP
 from illumgrid.tone import decode_srgb, encode_srgb
@@ -69,6 +70,7 @@ def lit(light: "Illumination", number: int, isovalue: float | None, progress: "P
             f"{shown_range(ends, 6)}; choose "
             "one within, or compute the light of a wider range"
         )
+    needs.check_surface(field, level, "smooth the volume, or downsample it")
     progress("surface", 0, 2)
     mesh = isosurface(field.volume, level, field.inside)
     if not len(mesh.faces):
