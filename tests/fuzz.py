@@ -11,6 +11,7 @@ import argparse
 import gzip
 import os
 import random
+import re
 import resource
 import signal
 import struct
@@ -31,6 +32,7 @@ import pydicom
 import pydicom.data
 import SimpleITK as sitk  # noqa: N813
 import tifffile
+import trimesh
 
 from dicom_files import HOUNSFIELD, enhanced
 from grid_files import cube_file, dx_file
@@ -38,6 +40,8 @@ from illumgrid.errors import BadInput
 from illumgrid.field.volume import Volume
 from illumgrid.io import store
 from illumgrid.io.readers import read_scene, read_volume
+from illumgrid.io.readers.mesh import read_mesh
+from illumgrid.io.readers.points import read_points
 from illumgrid.io.readers.sky import read_image
 from illumgrid.light import Illumination
 from test_store import example
@@ -89,6 +93,40 @@ def _volume(ending: str) -> Target:
         lambda file: read_volume(file.parent if file.suffix == ".dcm" else file),
         None if behind is None else lambda clean: clean.index(behind) + len(behind),
     )
+
+
+def _part(whole: Target) -> Target:
+    """The same file, of which a part is read."""
+    crop = (1, 5, 0, 6, 2, 7)
+    return Target(
+        f"part of {whole.name}", whole.make, lambda file: read_volume(file, crop=crop, downsample=2), whole.sealed
+    )
+
+
+def _points(ending: str) -> Target:
+    def make(folder: Path) -> Path:
+        file = folder / f"a.{ending}"
+        some = np.random.default_rng(0).random((40, 3))
+        if ending == "npy":
+            np.save(file, some)
+        elif ending == "csv":
+            np.savetxt(file, some, "%.5f", ",", header="x,y,z", comments="")
+        elif ending == "xyz":
+            file.write_text("40\ncell\n" + "".join(f"C {x:.4f} {y:.4f} {z:.4f}\n" for x, y, z in some))
+        else:
+            atom = "ATOM  {0:5d}  CA  ALA A{0:4d}    {1:8.3f}{2:8.3f}{3:8.3f}  1.00 20.00           C\n"
+            file.write_text("".join(atom.format(k + 1, *p) for k, p in enumerate(some * 20)) + "END\n")
+        return file
+
+    return Target(f"points {ending}", make, read_points)
+
+
+def _mesh(ending: str) -> Target:
+    def make(folder: Path) -> Path:
+        trimesh.creation.icosphere(1).export(folder / f"a.{ending}")
+        return folder / f"a.{ending}"
+
+    return Target(f"mesh {ending}", make, read_mesh)
 
 
 def _tiff(name: str, **options: Any) -> Target:
@@ -293,6 +331,12 @@ TARGETS = (
 )
 
 
+TARGETS += tuple(
+    _part(t) for t in TARGETS if t.name in ("nrrd", "nii.gz", "mha packed", "mrc", "mgz", "npy", "npz", "tif")
+)
+TARGETS += (*map(_points, ("npy", "csv", "xyz", "pdb")), *map(_mesh, ("ply", "stl", "obj", "glb")))
+
+
 def mutate(data: bytes, chance: random.Random) -> bytes:
     """Flip, cut, repeat or insert bytes, or write a false number, mostly near the head, which holds the sizes."""
     result = bytearray(data)
@@ -455,10 +499,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--only", help="name of a target")
+    parser.add_argument("--only", help="a pattern for names of targets")
     asked = parser.parse_args()
     end, seed, wrong = time.monotonic() + asked.seconds, asked.seed, 0
-    targets = [t for t in TARGETS if asked.only in (None, t.name)]
+    targets = [t for t in TARGETS if re.search(asked.only or "", t.name)]
     count = dict.fromkeys((t.name for t in targets), 0)
     while time.monotonic() < end:
         for target in targets:
