@@ -24,6 +24,8 @@ from illumgrid.grid.channels import mixed
 if TYPE_CHECKING:
     import trimesh
 
+    from illumgrid.io.elsewhere import Source
+
 
 @dataclass(frozen=True, eq=False)
 class Illumination:
@@ -234,8 +236,24 @@ class Illumination:
 
         return png(render(self, width=640, height=480))
 
-    def save(self, folder: str | os.PathLike[str], *, preview: bool = True, overwrite: bool = False) -> None:
+    def save(
+        self,
+        folder: str | os.PathLike[str],
+        *,
+        preview: bool = True,
+        overwrite: bool = False,
+        source: "Source | None" = None,
+    ) -> None:
         """Write a folder that holds everything: see `illumgrid.load`.
+
+        Parameters
+        ----------
+        folder : str or path-like
+        preview : bool
+            Whether with a picture.
+        overwrite : bool
+        source : illumgrid.io.elsewhere.Source, optional
+            The file that the fields come from: the folder then refers to it in place of holding them.
 
         Raises
         ------
@@ -250,4 +268,5 @@ class Illumination:
         recipe = {**self.recipe, "exposure": self.exposure}
         if self.weights:
             recipe["weights"] = dict(self.weights)
-        store.write(folder, store.Stored(self.scene, self.levels, self.grids, self.walls, recipe), picture, overwrite)
+        stored = store.Stored(self.scene, self.levels, self.grids, self.walls, recipe, source)
+        store.write(folder, stored, picture, overwrite)

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from illumgrid.field.builtin import Preset
     from illumgrid.field.scene import Field, Scene
     from illumgrid.field.volume import Side
+    from illumgrid.io.elsewhere import Source
     from illumgrid.light import Illumination
 
 
@@ -31,11 +32,15 @@ AROUND = ("studio", "sky", "floor", "box")
 
 @dataclass(frozen=True)
 class Input:
-    """What is to be lit: a name for the folder of the result, and how the scene is made, blurred by `smooth` voxels."""
+    """What is to be lit: a name for the folder of the result, and how the scene is made, blurred by `smooth` voxels.
+
+    `source` is the volume file of such a scene, where it is one.
+    """
 
     name: str
     make: Callable[[float], "Scene"]
     preset: "Preset | None" = None
+    source: "Callable[[float], Source] | None" = None
 
 
 def scene_input(
@@ -71,8 +76,13 @@ def scene_input(
             f"--signed and --{next(iter(also))} came together; expected one of them: --signed lights h >= c and h <= -c"
         )
     side: Side | None = None if signed else "below" if inside == "below" else "above"
-    make = partial(_volume_scene, name, surroundings or AROUND[0], albedo, limits, side, reading)
-    return Input(volume_name(name), make)
+    from illumgrid.io.elsewhere import Source
+
+    labels = labels_of(reading.get("label"))
+    plain = {key: value for key, value in reading.items() if key != "label"}
+    read_as = partial(Source, name, plain, labels, side)
+    make = partial(_volume_scene, read_as, surroundings or AROUND[0], albedo, limits)
+    return Input(volume_name(name), make, source=read_as)
 
 
 def _scene_file(name: str) -> Input:
@@ -82,30 +92,26 @@ def _scene_file(name: str) -> Input:
 
 
 def _volume_scene(
-    source: str, surroundings: str, albedo: Any, limits: Any, inside: "Side | None", reading: dict[str, Any],
-    smooth: float,
-) -> "Scene":  # fmt: skip
-    """The fields of a volume with what is around them; both signs of it if `inside` is None."""
+    read_as: "Callable[[float], Source]", surroundings: str, albedo: Any, limits: Any, smooth: float
+) -> "Scene":
+    """The fields of a volume with what is around them; both signs of it if its side is None."""
     import numpy as np
 
     from illumgrid.field.labels import fields_of
     from illumgrid.field.scene import Material, Scene
-    from illumgrid.field.signed import signed_pair, without_gaps
-    from illumgrid.field.volume import finite
-    from illumgrid.field.volume import smooth as blur
-    from illumgrid.io.readers import read_volume, volume_name
+    from illumgrid.field.signed import signed_pair
+    from illumgrid.io.readers import volume_name
 
     around: Callable[..., Scene] = getattr(Scene, surroundings)
-    name, labels = volume_name(source), labels_of(reading.get("label"))
-    if labels:
-        each = {label: blur(read_volume(source, **{**reading, "label": label}), smooth) for label in labels}
+    source = read_as(smooth)
+    name, volumes = volume_name(source.path), source.volumes()
+    if source.labels:
+        each = {label: volume for label, volume in volumes.items() if label is not None}
         return _around_all(around, fields_of(name, each, albedo, limits))
-    volume = read_volume(source, **reading)
-    if inside is None:
+    if source.side is None:
         material = None if albedo is None else Material(np.asarray(albedo))
-        return _around_all(around, signed_pair(name, blur(without_gaps(volume), smooth), limits, material))
-    volume = finite(volume, inside)
-    return around(blur(volume, smooth), albedo, limits, inside, name)
+        return _around_all(around, signed_pair(name, volumes[None], limits, material))
+    return around(volumes[None], albedo, limits, source.side, name)
 
 
 def _around_all(around: Callable[..., "Scene"], fields: "Sequence[Field]") -> "Scene":
@@ -249,6 +255,9 @@ def run(
         int | None, typer.Option(min=1, metavar="N", help="Threads. [default: one per processor]")
     ] = None,
     no_preview: Annotated[bool, typer.Option("--no-preview", help="Leave the picture out.")] = False,
+    no_embed: Annotated[
+        bool, typer.Option("--no-embed", help="Refer to the volume file, which must stay, in place of a copy in DIR.")
+    ] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a finished run in DIR.")] = False,
     resume: Annotated[
         bool,
@@ -272,8 +281,8 @@ def run(
 ) -> None:
     """Light a volume, the volumes of a scene file, or a built-in scene, for all isovalues at once.
 
-    DIR then holds illumination.exr, run.json and preview.png, and needs nothing else. A long run keeps what it has
-    finished in DIR.partial: after a stop the same command goes on from there.
+    DIR then holds illumination.exr, run.json and preview.png, and needs nothing else (--no-embed: the volume file).
+    A long run keeps what it has finished in DIR.partial: after a stop the same command goes on from there.
     """
     from illumgrid.chain import run as light_up
     from illumgrid.field.diagnosis import diagnose
@@ -289,6 +298,10 @@ def run(
             spacing=spacing, channel=channel, time=time_step, array=array, label=label, crop=crop, downsample=downsample
         )
         asked = scene_input(source, surroundings, limits, inside, signed, albedo, reading)
+        if no_embed and asked.source is None:
+            raise BadInput(
+                f"--no-embed came with the scene {asked.name!r}; expected a volume file with it; leave it out"
+            )
         if asked.preset and error is None and seconds is None:
             grid, paths = grid or asked.preset.grid, paths or asked.preset.paths
             isovalues = isovalues or asked.preset.isovalues
@@ -324,7 +337,8 @@ def run(
             )  # fmt: skip
         about = {"input": asked.name if source is None else source, "reading": reading, "smooth": smooth or 0.0}
         light = replace(light, recipe={**light.recipe, **about, "warnings": sentences})
-        _save(light, folder, not no_preview, overwrite or resume)
+        elsewhere = asked.source(smooth or 0.0) if no_embed and asked.source else None
+        _save(light, folder, not no_preview, overwrite or resume, elsewhere)
         keep.leave(folder)
         light = _judged(light, stages, folder)
         about = {key: light.recipe[key] for key in ("reached", "reached_uncertain", "reached_on_walls")}
@@ -339,16 +353,16 @@ def _why_auto() -> str:
     return f"backend: {registry.auto_backend()} ({registry.WHY_AUTO})"
 
 
-def _save(light: "Illumination", folder: Path, preview: bool, overwrite: bool) -> None:
+def _save(light: "Illumination", folder: Path, preview: bool, overwrite: bool, source: "Source | None" = None) -> None:
     """Save the light; where that fails, keep it elsewhere: hours of work are not lost to a full disk."""
     try:
-        light.save(folder, preview=preview, overwrite=overwrite)
+        light.save(folder, preview=preview, overwrite=overwrite, source=source)
     except Exception:
         for place in (gettempdir(), "~"):
             with suppress(Exception):
                 work = Path(mkdtemp(prefix="illumgrid-", dir=Path(place).expanduser()))
                 try:
-                    light.save(work / folder.name, preview=False)
+                    light.save(work / folder.name, preview=False, source=source)
                 except BaseException:
                     rmtree(work, ignore_errors=True)
                     raise

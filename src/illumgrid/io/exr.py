@@ -23,6 +23,8 @@ FIELD = "array (nx, ny, nz) = ({}, {}, {}) of {}; row = x*ny + y, column = z"
 BYTES = "bytes"
 DEFLATE_AT_MOST = 1032  # bytes out for one byte in: a file that claims more is refused before memory is asked for
 _WORD = 4  # bytes of a pixel
+_MULTIPART = 1 << 12  # in the version of a file
+_LINES = 16  # rows that ZIP packs together
 
 Image = NDArray[Any]
 Parts = dict[str, dict[str, Image]]
@@ -132,12 +134,17 @@ def check_whole(path: Path, plan: dict[str, Planned]) -> None:
     """
     _opened(path, plan, pixels=False)
     with path.open("rb") as file:
-        file.seek(8)
-        tables = sum(iter(lambda: _chunks(file), 0))
+        _, flags = struct.unpack("<2i", file.read(8))
+        if several := bool(flags & _MULTIPART):
+            tables = sum(iter(lambda: _chunks(file), 0))
+        else:
+            _chunks(file)
+            ((_, height),) = (of.size for of in plan.values())
+            tables = -(-height // _LINES)
         offsets = struct.unpack(f"<{tables}Q", file.read(8 * tables))
-        file.seek(max(offsets))
-        _, _, length = struct.unpack("<3i", file.read(12))
-        ends = max(offsets) + 12 + length
+        file.seek(max(offsets) + (4 if several else 0))  # behind the number of the part
+        _, length = struct.unpack("<2i", file.read(8))
+        ends = file.tell() + length
     if min(offsets) == 0 or ends != path.stat().st_size:
         raise OSError(28, "what was written cannot be read back")
 

@@ -34,6 +34,7 @@ from illumgrid.field.volume import NATIVE, Lattice, Volume, histogram
 from illumgrid.grid import RGB, Channels, GridSpec, IlluminationGrid, WallTexture
 from illumgrid.io import disk, exr
 from illumgrid.io.disk import ELSEWHERE
+from illumgrid.io.elsewhere import Source, digest, fields_again, referred
 
 FORMAT = 3  # 1 had RGB only; to 2, fields were float32 with x fastest, and one checksum covered both files
 EXR, RUN, PREVIEW, MOMENTS = "illumination.exr", "run.json", "preview.png", "moments.npz"
@@ -56,6 +57,7 @@ class Stored:
     """What a finished folder holds, except the picture: one grid and one column of levels for every field.
 
     The recipe says how the run was made, in what JSON has: finite numbers, text, booleans, None, lists, dicts of text.
+    With a `source` the fields are not written: the folder refers to it.
     """
 
     scene: Scene
@@ -63,6 +65,7 @@ class Stored:
     grids: tuple[IlluminationGrid, ...]
     walls: tuple[WallTexture, ...]
     recipe: dict[str, Any]
+    source: Source | None = None
 
     def __post_init__(self) -> None:
         fields, table = len(self.scene.fields), np.asarray(self.levels.table)
@@ -117,6 +120,10 @@ def write(folder: str | os.PathLike[str], stored: Stored, picture: bytes | None,
         As `claim` does, also if another run took the folder meanwhile; and if the disk is full.
     """
     record = _describe(stored)
+    if stored.source is not None:
+        record["source"] = json.loads(json.dumps(referred(stored.source, Path(os.path.abspath(folder)))))
+        for about, f in zip(record["scene"]["fields"], stored.scene.fields):
+            about["sha256"] = digest(f.volume)
     claim(folder, overwrite)
     with disk.sentences(f"{folder} could not be written; the disk may be full", ELSEWHERE):
         place = Path(os.path.abspath(folder))
@@ -197,7 +204,9 @@ def read(folder: str | os.PathLike[str]) -> Stored:
             raise BadInput(f"it, or {RUN} beside it, was damaged or changed since it was written")
         parts = exr.read(place / EXR, plan)
     with disk.sentences(f"{place / RUN} is not the record of a run", AGAIN):
-        return _rebuild(record, plan, parts)
+        fields = [about.get("sha256") for about in record["scene"]["fields"]]
+        volumes = fields_again(record["source"], Path(os.path.abspath(place)), fields) if "source" in record else None
+        return _rebuild(record, plan, parts, volumes)
 
 
 def describe(folder: str | os.PathLike[str]) -> Record:
@@ -299,9 +308,18 @@ def _read_record(path: Path) -> Record:
     return record
 
 
-def _rebuild(record: Record, plan: Plan, parts: exr.Parts) -> Stored:
+def _field_volume(record: Record, about: Record, plan: Plan, parts: exr.Parts) -> Volume:
+    part = f"field/{about['name']}"
+    inside, image = plan[part], parts.pop(part)
+    values = exr.field_values(image, inside) if inside.field else exr.array(image, "Y", inside.shape)
+    origin, spacing, direction = (about[k] for k in PLACE)
+    slope, intercept = about.get("slope", 1.0), about.get("intercept", 0.0)
+    return Volume(values, origin, spacing, direction, slope, intercept, about.get("unit"))
+
+
+def _rebuild(record: Record, plan: Plan, parts: exr.Parts, volumes: list[Volume] | None) -> Stored:
     grids, fields = [], []
-    for about in record["scene"]["fields"]:
+    for number, about in enumerate(record["scene"]["fields"]):
         where, part = record["grids"][about["name"]], f"light/{about['name']}"
         spec, channels, light = (
             GridSpec(_shape(where), *(where[k] for k in PLACE)),
@@ -311,12 +329,7 @@ def _rebuild(record: Record, plan: Plan, parts: exr.Parts) -> Stored:
         values, error, support = (exr.array(light, names, spec.shape) for names in (channels.names, "error", "support"))
         errors = exr.array(light, tuple(_errors(channels)), spec.shape) if _errors(channels) else None
         grids.append(IlluminationGrid(spec, values, error, support, channels, errors))
-        part = f"field/{about['name']}"
-        inside, image = plan[part], parts.pop(part)
-        values = exr.field_values(image, inside) if inside.field else exr.array(image, "Y", inside.shape)
-        origin, spacing, direction = (about[k] for k in PLACE)
-        slope, intercept = about.get("slope", 1.0), about.get("intercept", 0.0)
-        volume = Volume(values, origin, spacing, direction, slope, intercept, about.get("unit"))
+        volume = _field_volume(record, about, plan, parts) if volumes is None else volumes[number]
         material = Material(about["albedo"], about["emission"])
         falling = about.get("falling", False)
         fields.append(Field(about["name"], volume, material, about["range"], about["inside"], falling))
@@ -369,7 +382,8 @@ def _plan(record: Record) -> Plan:
         channels = _channels(record, part)
         names = (*channels.names, *_errors(channels), "error", "support")
         plan[part] = exr.Planned(_shape(record["grids"][about["name"]]), names)
-        plan[f"field/{about['name']}"] = _planned_field(record, about)
+        if "source" not in record:
+            plan[f"field/{about['name']}"] = _planned_field(record, about)
     for about in record["scene"]["quads"]:
         part = f"wall/{about['name']}"
         plan[part] = exr.Planned(_wall_shape(about, record), (*_channels(record, part).names, "support"))
@@ -399,7 +413,8 @@ def _write_exr(path: Path, stored: Stored) -> None:
             errors = np.full(grid.light.shape, np.inf, np.float32) if grid.errors is None else grid.errors
             arrays |= {name: errors[..., c] for c, name in enumerate(names)}
         parts[f"light/{f.name}"] = images(arrays)
-        parts[f"field/{f.name}"] = exr.of_field(f.volume.values)
+        if stored.source is None:
+            parts[f"field/{f.name}"] = exr.of_field(f.volume.values)
     for quad, wall in zip(stored.scene.quads, stored.walls):
         turned = split(wall) | {"support": wall.support}
         parts[f"wall/{quad.name}"] = images({channel: array.swapaxes(0, 2) for channel, array in turned.items()})
