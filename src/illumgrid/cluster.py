@@ -143,7 +143,7 @@ def cluster(
         logging.getLogger("distributed").setLevel(logging.ERROR)
         if address is None:
             local = LocalCluster(
-                n_workers=workers, threads_per_worker=1, processes=True, dashboard_address=None, memory_limit=0
+                n_workers=workers, threads_per_worker=1, processes=True, dashboard_address=":0", memory_limit=0
             )
             stack.enter_context(local)
             address = local.scheduler_address
