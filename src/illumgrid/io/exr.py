@@ -127,20 +127,24 @@ def _opened(path: Path, plan: dict[str, Planned], pixels: bool) -> Any:
 
 
 def check_whole(path: Path, plan: dict[str, Planned]) -> None:
-    """Refuse a file of other parts than planned, or whose last pixels are missing, which the library does not report.
+    """Refuse a file of other parts than planned, or one that has no end."""
+    _opened(path, plan, pixels=False)
+    check_end(path, next(iter(plan.values())).size[1])
+
+
+def check_end(path: Path, rows: int) -> None:
+    """Refuse a file whose last pixels are missing, which the library does not report; `rows` are those of a lone part.
 
     The tables of offsets, after the headers, say where the last piece begins; it ends with the file. Pixels are not
     read back: they may be as many as fit into memory once.
     """
-    _opened(path, plan, pixels=False)
     with path.open("rb") as file:
         _, flags = struct.unpack("<2i", file.read(8))
         if several := bool(flags & _MULTIPART):
             tables = sum(iter(lambda: _chunks(file), 0))
         else:
             _chunks(file)
-            ((_, height),) = (of.size for of in plan.values())
-            tables = -(-height // _LINES)
+            tables = -(-rows // _LINES)
         offsets = struct.unpack(f"<{tables}Q", file.read(8 * tables))
         file.seek(max(offsets) + (4 if several else 0))  # behind the number of the part
         _, length = struct.unpack("<2i", file.read(8))

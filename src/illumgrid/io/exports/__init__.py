@@ -131,12 +131,12 @@ def write(
     lattice = light.grids[number].spec if on != "field" else light.scene.fields[number].volume
     todo = "leave out --on field, or write a .nrrd, which holds one array"
     needs.check("the file", needs.TO_EXPORT * math.prod(lattice.shape) * len(names) / len(arrays.NAMES), todo)
-    points = arrays.points_of(light, number, on or "grid", names, progress)
+    points = arrays.points_of(light, number, on or "grid", names)
     with disk.fresh_file(path) as fresh:
         LATTICES[ending](fresh, points, progress)
     shape = " x ".join(map(str, points.lattice.shape))
     where = "voxels" if on == "field" else "nodes"
-    return f"{', '.join(points.arrays)} of {points.field!r} at {shape} {where}"
+    return f"{', '.join(points.kinds)} of {points.field!r} at {shape} {where}"
 
 
 def check_field(path: str | os.PathLike[str]) -> None:
@@ -154,6 +154,6 @@ def write_field(
     """Write a field without light to a `.nrrd`, `.vti` or `.npz`, as the array "field"; whole, or not at all."""
     check_field(path)
     needs.check("the file", needs.TO_EXPORT * math.prod(volume.shape) / len(arrays.NAMES), "choose a larger spacing")
-    points = arrays.Points(name, volume, {"field": volume.in_units(volume.values)})
+    points = arrays.field_alone(volume, name)
     with disk.fresh_file(path) as fresh:
         FIELDS[Path(path).suffix.lower()](fresh, points, progress)

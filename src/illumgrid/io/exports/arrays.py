@@ -1,7 +1,8 @@
 """The light of a field as arrays on a lattice, and the formats that hold arrays."""
 
 import gzip
-from collections.abc import Sequence
+import zipfile
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from illumgrid.errors import BadInput
-from illumgrid.field.volume import Floats, Lattice, index_to_world, interpolate, world_to_index
+from illumgrid.field.volume import Floats, Lattice, Volume, index_to_world, interpolate, world_to_index
 from illumgrid.tone import curve, encode_srgb
 
 if TYPE_CHECKING:
@@ -24,9 +25,13 @@ _AT_ONCE = 1 << 18
 """Points that are looked up together: bounds the memory."""
 
 
+Index = NDArray[np.integer]
+Arrays = dict[str, NDArray[Any]]
+
+
 @dataclass(frozen=True, eq=False)
 class Points:
-    """Arrays (nx, ny, nz) or (nx, ny, nz, 3) on a lattice, all of one field.
+    """Arrays on a lattice, all of one field: computed a part at a time, as a file takes them.
 
     Parameters
     ----------
@@ -34,8 +39,10 @@ class Points:
         Name of the field.
     lattice : Lattice
         Where the points lie in the world.
-    arrays : dict of array
-        By name: irradiance (linear RGB, float32), error, support, field (float32), color (sRGB, uint8).
+    kinds : dict of dtype
+        By name: irradiance (linear RGB, float32), error, support, field (float32 or float64), color (sRGB, uint8).
+    at : callable
+        Takes names and whole indices (m, 3); returns arrays (m,) or, of irradiance and color, (m, 3).
     albedo : (3,) float64, optional
         Of the field's material; None where there is no light.
     exposure : float, optional
@@ -44,9 +51,25 @@ class Points:
 
     field: str
     lattice: Lattice
-    arrays: dict[str, NDArray[Any]]
+    kinds: dict[str, np.dtype[Any]]
+    at: Callable[[set[str], Index], Arrays]
     albedo: Floats | None = None
     exposure: float | None = None
+
+    def components(self, name: str) -> int:
+        """Numbers at each point."""
+        return 3 if name in ("irradiance", "color") else 1
+
+    def parts(self, names: Sequence[str], x_fastest: bool, progress: "Progress") -> Iterator[Arrays]:
+        """Yield consecutive points, with x running fastest, as image formats want it, or z, as NumPy does."""
+        shape = self.lattice.shape[::-1] if x_fastest else self.lattice.shape
+        count = int(np.prod(shape))
+        for first in range(0, count, _AT_ONCE):
+            progress("points", first, count)
+            index = np.unravel_index(np.arange(first, min(first + _AT_ONCE, count)), shape)
+            found = self.at(set(names), np.stack(index[::-1] if x_fastest else index, axis=-1))
+            yield {name: found[name].astype(self.kinds[name], copy=False) for name in names}
+        progress("points", count, count)
 
 
 def display_linear(light: "Illumination", number: int, irradiance: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -55,23 +78,30 @@ def display_linear(light: "Illumination", number: int, irradiance: NDArray[np.fl
     return np.asarray(curve(irradiance * factor), dtype=np.float32)
 
 
-def points_of(light: "Illumination", number: int, on: str, names: Sequence[str], progress: "Progress") -> Points:
+def points_of(light: "Illumination", number: int, on: str, names: Sequence[str]) -> Points:
     """Arrays of field `number` at the nodes of its grid, or at its voxels."""
     field, grid = light.scene.fields[number], light.grids[number]
     lattice: Lattice = grid.spec if on == "grid" else field.volume
-    count = int(np.prod(lattice.shape))
-    found: dict[str, list[NDArray[Any]]] = {name: [] for name in names}
-    for first in range(0, count, _AT_ONCE):
-        progress("points", first, count)
-        flat = np.arange(first, min(first + _AT_ONCE, count))
-        world = index_to_world(lattice, np.stack(np.unravel_index(flat, lattice.shape), axis=-1))
-        here = _at(light, number, world, set(names))
-        for name in names:
-            found[name].append(here[name])
-    progress("points", count, count)
-    shaped = {name: np.concatenate(parts) for name, parts in found.items()}
-    shaped = {name: array.reshape(*lattice.shape, *array.shape[1:]) for name, array in shaped.items()}
-    return Points(field.name, lattice, shaped, field.material.albedo, light.exposure)
+    kinds = dict.fromkeys(NAMES, np.dtype(np.float32)) | {"color": np.dtype(np.uint8), "field": _kind(field.volume)}
+
+    def at(these: set[str], index: Index) -> Arrays:
+        return _at(light, number, index_to_world(lattice, index), these)
+
+    return Points(field.name, lattice, {name: kinds[name] for name in names}, at, field.material.albedo, light.exposure)
+
+
+def field_alone(volume: Volume, name: str) -> Points:
+    """The values of a field without light, as the array "field"."""
+
+    def at(these: set[str], index: Index) -> Arrays:
+        return {"field": volume.in_units(volume.values[tuple(index.T)])}
+
+    return Points(name, volume, {"field": _kind(volume)}, at)
+
+
+def _kind(volume: Volume) -> np.dtype[Any]:
+    """Where the field has an offset or scale that single precision does not hold, nor does the file."""
+    return np.dtype(np.float32 if volume.slope == 1 and volume.intercept == 0 else np.float64)
 
 
 def _at(light: "Illumination", number: int, world: Floats, names: set[str]) -> dict[str, NDArray[Any]]:
@@ -84,27 +114,18 @@ def _at(light: "Illumination", number: int, world: Floats, names: set[str]) -> d
     if names & {"error", "support"}:
         here["error"], here["support"] = grid.certainty(world)
     if "field" in names:
-        values = interpolate(field.volume, world_to_index(field.volume, world))
-        # Where the field has an offset or scale that single precision does not hold, nor does the file.
-        plain = field.volume.slope == 1 and field.volume.intercept == 0
-        here["field"] = values.astype(np.float32) if plain else values
+        here["field"] = interpolate(field.volume, world_to_index(field.volume, world))
     return here
-
-
-def x_fastest(array: NDArray[Any]) -> NDArray[Any]:
-    """(nx, ny, nz, ...) as (nz, ny, nx, ...): in memory x runs fastest, as image formats want it."""
-    return np.ascontiguousarray(array.swapaxes(0, 2))
 
 
 def write_nrrd(path: Path, points: Points, progress: "Progress") -> None:
     """Write the one array of `points`; space left-posterior-superior, directions as in the world; gzip."""
-    ((name, array),) = points.arrays.items()
-    progress("file", 0, 1)
+    ((name, kind),) = points.kinds.items()
     lattice = points.lattice
     steps = [_vector(lattice.direction[:, axis] * lattice.spacing[axis]) for axis in range(3)]
-    color = array.ndim == 4
+    color = points.components(name) == 3
     head = {
-        "type": {"f4": "float", "f8": "double", "u1": "uint8"}[array.dtype.str[1:]],
+        "type": {"f4": "float", "f8": "double", "u1": "uint8"}[kind.str[1:]],
         "dimension": 4 if color else 3,
         "space": "left-posterior-superior",
         "sizes": " ".join(map(str, (3, *lattice.shape) if color else lattice.shape)),
@@ -118,12 +139,11 @@ def write_nrrd(path: Path, points: Points, progress: "Progress") -> None:
     if name == "color":
         about["illumgrid exposure"] = repr(points.exposure)
     lines = ["NRRD0004", *(f"{k}: {v}" for k, v in head.items()), *(f"{k}:={v}" for k, v in about.items()), "", ""]
-    data = x_fastest(array).astype(array.dtype.newbyteorder("<"), copy=False)
     with open(path, "wb") as file:
         file.write("\n".join(lines).encode())
         with gzip.GzipFile(fileobj=file, mode="wb", compresslevel=6, mtime=0) as packed:
-            packed.write(data.data)
-    progress("file", 1, 1)
+            for part in points.parts([name], True, progress):
+                packed.write(part[name].astype(kind.newbyteorder("<"), copy=False).tobytes())
 
 
 def _vector(numbers: Floats) -> str:
@@ -134,9 +154,9 @@ def write_exr(path: Path, points: Points, progress: "Progress") -> None:
     """Write an image nx wide and ny·nz high, float32: R, G, B (irradiance), error, support, field."""
     import OpenEXR
 
-    from illumgrid.io.exr import LAYOUT
+    from illumgrid.io.exr import LAYOUT, check_end
 
-    if points.arrays["field"].dtype == np.float64:
+    if points.kinds["field"] == np.float64:
         raise BadInput("the field's values need double precision, which .exr lacks; expected .vti, .nrrd or .npz")
     nx, ny, nz = points.lattice.shape
     progress("file", 0, 1)
@@ -145,27 +165,38 @@ def write_exr(path: Path, points: Points, progress: "Progress") -> None:
         "origin": points.lattice.origin, "spacing": points.lattice.spacing, "direction": points.lattice.direction,
         "exposure": points.exposure,
     }  # fmt: skip
-    channels = {
-        "RGB" if name == "irradiance" else name: x_fastest(array.astype(np.float32, copy=False)).reshape(
-            nz * ny, nx, *array.shape[3:]
-        )
-        for name, array in points.arrays.items()
-        if name != "color"  # an EXR viewer makes its own
-    }
+    channels, first = {}, 0
+    shown = [name for name in points.kinds if name != "color"]  # an EXR viewer makes its own
+    for name in shown:
+        several = (3,) if points.components(name) == 3 else ()
+        channels["RGB" if name == "irradiance" else name] = np.empty((nz * ny, nx, *several), np.float32)
+    for part in points.parts(shown, True, progress):
+        for array, image in zip(part.values(), channels.values()):
+            image.reshape(-1, *array.shape[1:])[first : first + len(array)] = array
+        first += len(array)
     OpenEXR.File(header, channels).write(str(path))
-    # The library flushes where it cannot report a full disk, and leaves out channels that it cannot read back: look.
-    if {*OpenEXR.File(str(path)).channels()} != {*channels}:
-        raise BadInput("what was written cannot be read back, the disk may be full")
+    check_end(path, nz * ny)
     progress("file", 1, 1)
 
 
 def write_npz(path: Path, points: Points, progress: "Progress") -> None:
-    """Write the arrays, indexed [x, y, z], and where they lie."""
+    """Write the arrays, indexed [x, y, z], and where they lie; one after the other, as a ZIP takes them."""
     lattice = points.lattice
-    progress("file", 0, 1)
     place: dict[str, Any] = {name: getattr(lattice, name) for name in ("origin", "spacing", "direction")}
     if points.albedo is not None and points.exposure is not None:
         place |= {"albedo": points.albedo, "exposure": np.float64(points.exposure)}
-    with path.open("wb") as file:  # to a name that ends otherwise, as in .NPZ, NumPy adds .npz
-        np.savez_compressed(file, **(points.arrays | place))
-    progress("file", 1, 1)
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, allowZip64=True) as pack:
+        for number, (name, kind) in enumerate(points.kinds.items()):
+
+            def so_far(what: str, done: int, total: int, number: int = number) -> None:
+                progress(what, number * total + done, len(points.kinds) * total)
+
+            several = (3,) if points.components(name) == 3 else ()
+            about = {"descr": np.lib.format.dtype_to_descr(kind), "fortran_order": False}
+            with pack.open(f"{name}.npy", "w", force_zip64=True) as member:
+                np.lib.format.write_array_header_1_0(member, about | {"shape": (*lattice.shape, *several)})
+                for part in points.parts([name], False, so_far):
+                    member.write(part[name].tobytes())
+        for name, value in place.items():
+            with pack.open(f"{name}.npy", "w") as member:
+                np.lib.format.write_array(member, np.asarray(value), allow_pickle=False)

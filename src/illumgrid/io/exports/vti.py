@@ -8,14 +8,17 @@ import struct
 import sys
 import zlib
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from shutil import copyfileobj
+from tempfile import TemporaryFile
+from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from illumgrid.io.exports.arrays import Points, x_fastest
+from illumgrid.io.exports.arrays import Points
 
 if TYPE_CHECKING:
     from illumgrid.bake import Progress
@@ -33,19 +36,25 @@ def write(path: Path, points: Points, progress: "Progress") -> None:
     """
     nx, ny, nz = points.lattice.shape
     extent = f"0 {nx - 1} 0 {ny - 1} 0 {nz - 1}"
-    total = sum(array.nbytes for array in points.arrays.values())
-    packed: list[bytes] = []
-    offset, done, entries = 0, 0, []
-    for name, array in points.arrays.items():
-        progress("file", done, total)
-        packed.append(_packed(array))
-        components = 3 if array.ndim == 4 else 1
+    with ExitStack() as open_files:
+        packed = {name: _Packed(open_files.enter_context(TemporaryFile(dir=path.parent))) for name in points.kinds}
+        with ThreadPoolExecutor() as pool:  # zlib works without the interpreter's lock
+            for part in points.parts(list(points.kinds), True, progress):
+                for name, array in part.items():
+                    packed[name].add(array, pool)
+            for one in packed.values():
+                one.finish()
+        _assemble(path, points, extent, packed)
+
+
+def _assemble(path: Path, points: Points, extent: str, packed: dict[str, "_Packed"]) -> None:
+    offset, entries = 0, []
+    for name, one in packed.items():
         entries.append(
-            f'<DataArray type="{_TYPES[array.dtype.name]}" Name="{name}" NumberOfComponents="{components}" '
-            f'format="appended" offset="{offset}"/>'
+            f'<DataArray type="{_TYPES[points.kinds[name].name]}" Name="{name}" '
+            f'NumberOfComponents="{points.components(name)}" format="appended" offset="{offset}"/>'
         )
-        offset += len(packed[-1])
-        done += array.nbytes
+        offset += one.length
     kind = 'type="ImageData" version="1.0" byte_order="LittleEndian" header_type="UInt64"'
     head = f"""<?xml version="1.0" encoding="utf-8"?>
 <!-- illumgrid {version("illumgrid")}; color is sRGB of albedo/pi * irradiance * exposure -->
@@ -62,9 +71,9 @@ def write(path: Path, points: Points, progress: "Progress") -> None:
 _"""
     with path.open("wb") as file:
         file.write(head.encode())
-        file.writelines(packed)
+        for one in packed.values():
+            one.write_to(file)
         file.write(b"\n</AppendedData>\n</VTKFile>\n")
-    progress("file", total, total)
 
 
 def _light(points: Points) -> str:
@@ -83,13 +92,38 @@ def _text(numbers: ArrayLike) -> str:
     return " ".join(repr(float(x)) for x in np.ravel(numbers))
 
 
-def _packed(array: NDArray[Any]) -> bytes:
-    """An array as VTK's zlib blocks: their number, size, size of a last shorter one, packed sizes; then the blocks."""
-    flat = x_fastest(array)
-    if sys.byteorder == "big":
-        flat = flat.byteswap()
-    raw = flat.data.cast("B")
-    with ThreadPoolExecutor() as pool:  # zlib works without the interpreter's lock
-        blocks = list(pool.map(lambda at: zlib.compress(raw[at : at + _BLOCK], 1), range(0, len(raw), _BLOCK)))
-    sizes = [len(blocks), _BLOCK, len(raw) % _BLOCK, *map(len, blocks)]
-    return struct.pack(f"<{len(sizes)}Q", *sizes) + b"".join(blocks)
+class _Packed:
+    """An array as VTK's zlib blocks, in a file of its own until their sizes, which come first, are known."""
+
+    def __init__(self, file: IO[bytes]) -> None:
+        self.file, self.sizes, self.last, self.rest = file, list[int](), 0, b""
+
+    def add(self, array: NDArray[Any], pool: ThreadPoolExecutor) -> None:
+        """Pack as many whole blocks as there are with these numbers."""
+        raw = self.rest + (array.byteswap() if sys.byteorder == "big" else array).tobytes()
+        whole = len(raw) // _BLOCK * _BLOCK
+        self.rest = raw[whole:]
+        for block in pool.map(lambda at: zlib.compress(raw[at : at + _BLOCK], 1), range(0, whole, _BLOCK)):
+            self._append(block)
+
+    def finish(self) -> None:
+        """Pack what is left as the last, shorter block."""
+        self.last = len(self.rest)
+        if self.rest:
+            self._append(zlib.compress(self.rest, 1))
+
+    def _append(self, block: bytes) -> None:
+        self.file.write(block)
+        self.sizes.append(len(block))
+
+    @property
+    def length(self) -> int:
+        """Bytes with the sizes in front."""
+        return 8 * (3 + len(self.sizes)) + sum(self.sizes)
+
+    def write_to(self, file: IO[bytes]) -> None:
+        """Append to a file: number of blocks, size, size of a last shorter one, packed sizes; then the blocks."""
+        head = [len(self.sizes), _BLOCK, self.last, *self.sizes]
+        file.write(struct.pack(f"<{len(head)}Q", *head))
+        self.file.seek(0)
+        copyfileobj(self.file, file)
