@@ -1,6 +1,7 @@
 """What the user says of a volume that its file does not: spacing, which of several, which part."""
 
 import sys
+import tempfile
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from illumgrid.errors import BadInput, IllumgridWarning
 from illumgrid.field.volume import index_to_world
 from illumgrid.io.readers import limits, read_scene, read_volume
 from illumgrid.io.readers.stored import Stored, pick, place, unsheared
-from volume_files import TURN, refused, values, write
+from volume_files import TURN, refused, values, write, zipped
 
 
 def test_spacing_and_crop_keep_the_voxels_where_they_are(tmp_path):
@@ -143,3 +144,14 @@ def test_a_reader_that_is_not_installed_is_named_with_its_extra(tmp_path, monkey
     monkeypatch.delitem(sys.modules, "illumgrid.io.readers.itk", raising=False)
     monkeypatch.setitem(sys.modules, "SimpleITK", None)
     refused(tmp_path / "a.gipl", "SimpleITK", "pip install illumgrid[itk]")
+
+
+def test_what_killed_processes_unpacked_is_swept(tmp_path, monkeypatch):
+    """A gzipped GIPL is unpacked into a file for ITK, which is then removed; SIGKILL leaves it."""
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
+    left = tmp_path / "temporary" / ".illumgrid-unpacked-k1lled00"
+    left.mkdir(parents=True)
+    (left / "new.gipl").write_bytes(b"half")
+    write(tmp_path / "a.gipl")
+    assert np.array_equal(read_volume(zipped(tmp_path / "a.gipl")).values, values())
+    assert not any((tmp_path / "temporary").iterdir())

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import SimpleITK as sitk  # noqa: N813
 
-from illumgrid.errors import IllumgridWarning
+from illumgrid.errors import BadInput, IllumgridWarning
 from illumgrid.field.volume import index_to_world
-from illumgrid.io.readers import read_volume
+from illumgrid.io.readers import read_scene, read_volume
 from volume_files import meta_head, nrrd_head, refused, values, write
 
 # MetaImage
@@ -96,6 +96,30 @@ def test_only_files_beside_the_header_are_opened(tmp_path, ending, named):
     head = nrrd_head("raw", f"data file: {name}\n") if ending == "nhdr" else meta_head(name)
     (tmp_path / "in" / f"a.{ending}").write_bytes(head)
     refused(tmp_path / "in" / f"a.{ending}")
+
+
+@pytest.mark.parametrize("ending", ["mhd", "nhdr"])
+def test_files_elsewhere_are_opened_where_that_is_allowed(tmp_path, call, ending):
+    (tmp_path / "headers").mkdir()
+    (tmp_path / "a.raw").write_bytes(values().T.tobytes())
+    file = tmp_path / "headers" / f"a.{ending}"
+    for named in ("../a.raw", str(tmp_path / "a.raw")):
+        head = meta_head(named) if ending == "mhd" else nrrd_head("raw", f"data file: {named}\n")
+        file.write_bytes(head)
+        refused(file, "not in the folder of the header", "--follow")
+        assert np.array_equal(read_volume(file, follow=True).values, values())
+    assert "5 x 6 x 7 voxels" in call("info", str(file), "--follow")
+    os.mkfifo(tmp_path / "pipe")
+    file.write_bytes(head.replace(b"a.raw", b"pipe"))
+    with pytest.raises(BadInput, match="pipe is neither a file nor a folder"):
+        read_volume(file, follow=True)
+    table = f'[[field]]\nname = "a"\nvolume = "headers/a.{ending}"\nrange = [20.0, 150.0]\n'
+    file.write_bytes(head)
+    (tmp_path / "s.toml").write_text(table + "follow = true\n")
+    assert read_scene(tmp_path / "s.toml").fields[0].volume.shape == (5, 6, 7)
+    (tmp_path / "s.toml").write_text(table)
+    with pytest.raises(BadInput, match="--follow"):
+        read_scene(tmp_path / "s.toml")
 
 
 def test_header_size_and_byte_skip(tmp_path):

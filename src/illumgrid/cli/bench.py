@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from illumgrid.cli.reading import Array, Channel, Crop, Downsample, Label, Spacing, Time
+from illumgrid.cli.reading import Array, Channel, Crop, Downsample, Follow, Label, Spacing, Time
 from illumgrid.cli.reading import given as as_given
 from illumgrid.cli.terminal import progress_bars, reported_warnings, result, say
 
@@ -30,6 +30,7 @@ def bench(
     label: Label = None,
     crop: Crop = None,
     downsample: Downsample = None,
+    follow: Follow = False,
     smooth: Annotated[
         float | None, typer.Option(min=0.0, metavar="SIGMA", help="Gaussian blur in voxels before anything else.")
     ] = None,
@@ -49,7 +50,14 @@ def bench(
     from illumgrid.show.difference import studio
 
     reading = as_given(
-        spacing=spacing, channel=channel, time=time_step, array=array, label=label, crop=crop, downsample=downsample
+        spacing=spacing,
+        channel=channel,
+        time=time_step,
+        array=array,
+        label=label,
+        crop=crop,
+        downsample=downsample,
+        follow=follow or None,
     )
     given = scene_input(source, None, limits, None, False, None, reading)
     folder = output or Path(f"{given.name}-bench")

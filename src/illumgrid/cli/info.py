@@ -5,7 +5,19 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from illumgrid.cli.reading import Array, Channel, Crop, Downsample, Label, Spacing, Time, check_inside, given, labels_of
+from illumgrid.cli.reading import (
+    Array,
+    Channel,
+    Crop,
+    Downsample,
+    Follow,
+    Label,
+    Spacing,
+    Time,
+    check_inside,
+    given,
+    labels_of,
+)
 from illumgrid.cli.terminal import Ignore, omitted_light, reported_warnings, result
 
 if TYPE_CHECKING:
@@ -51,6 +63,7 @@ def info(
     label: Label = None,
     crop: Crop = None,
     downsample: Downsample = None,
+    follow: Follow = False,
     ignore: Ignore = None,
 ) -> None:
     """Describe a volume or a finished run; for a volume, suggest a range and warn of what will limit the result."""
@@ -59,7 +72,14 @@ def info(
 
     check_inside(inside, label)
     reading = given(
-        spacing=spacing, channel=channel, time=time, array=array, label=label, crop=crop, downsample=downsample
+        spacing=spacing,
+        channel=channel,
+        time=time,
+        array=array,
+        label=label,
+        crop=crop,
+        downsample=downsample,
+        follow=follow or None,
     )
     with reported_warnings(ignore):
         if not store.is_run(source):

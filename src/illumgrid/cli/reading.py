@@ -28,6 +28,9 @@ Crop = Annotated[
 Downsample = Annotated[
     int | None, typer.Option("--downsample", min=1, metavar="N", help="Means over blocks of N x N x N voxels.")
 ]
+Follow = Annotated[
+    bool, typer.Option("--follow", help="Read data files outside the folder of the header that names them.")
+]
 
 
 def labels_of(text: str | None) -> tuple[int, ...]:

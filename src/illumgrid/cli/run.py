@@ -14,7 +14,19 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from illumgrid.cli.long import check_spread, kept, shared_out, spread
-from illumgrid.cli.reading import Array, Channel, Crop, Downsample, Label, Spacing, Time, check_inside, given, labels_of
+from illumgrid.cli.reading import (
+    Array,
+    Channel,
+    Crop,
+    Downsample,
+    Follow,
+    Label,
+    Spacing,
+    Time,
+    check_inside,
+    given,
+    labels_of,
+)
 from illumgrid.cli.terminal import Ignore, omitted_light, progress_bars, reported_warnings, say
 from illumgrid.errors import BadInput, shown_range, tell
 
@@ -237,6 +249,7 @@ def run(
     label: Label = None,
     crop: Crop = None,
     downsample: Downsample = None,
+    follow: Follow = False,
     settings: Annotated[
         list[str] | None, typer.Option("--set", metavar="STAGE.OPTION=VALUE", help="Any option of a stage, repeatable.")
     ] = None,
@@ -295,7 +308,14 @@ def run(
         names = {"sampler": sampler, "backend": backend, "interpolator": interpolator}
         stages = _stages(names, settings or [], {"backend.threads": threads, "sampler.count": isovalues})
         reading = given(
-            spacing=spacing, channel=channel, time=time_step, array=array, label=label, crop=crop, downsample=downsample
+            spacing=spacing,
+            channel=channel,
+            time=time_step,
+            array=array,
+            label=label,
+            crop=crop,
+            downsample=downsample,
+            follow=follow or None,
         )
         asked = scene_input(source, surroundings, limits, inside, signed, albedo, reading)
         if no_embed and asked.source is None:

@@ -72,6 +72,7 @@ def read_volume(
     label: int | None = None,
     crop: Sequence[int] | None = None,
     downsample: int | None = None,
+    follow: bool = False,
 ) -> Volume:
     """Read a scalar field from a file, or from a folder of slices.
 
@@ -91,6 +92,8 @@ def read_volume(
         First voxel and last + 1 along x, y and z.
     downsample : int, optional
         Take means over blocks of so many voxels along each axis.
+    follow : bool
+        Read data files outside the folder of the header that names them.
 
     Returns
     -------
@@ -112,7 +115,7 @@ def read_volume(
     if not os.fspath(path):
         raise BadInput(f"the name of the volume is empty; {EXPECTED}")  # and not the folder one is in
     file = Path(os.path.abspath(path))
-    wanted = Wanted(channel, time, array, crop, None if label is not None else downsample)
+    wanted = Wanted(channel, time, array, crop, None if label is not None else downsample, follow)
     with named(file, EXPECTED) as shown:
         stored = _read(file, wanted)
         if spacing is not None:

@@ -7,12 +7,13 @@ import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from tempfile import TemporaryDirectory
+from tempfile import gettempdir
 
 import numpy as np
 import SimpleITK as sitk  # noqa: N813  (its usual name)
 
 from illumgrid.errors import BadInput
+from illumgrid.io import disk
 from illumgrid.io.readers.limits import CHUNK, check_axes, check_memory, check_size
 from illumgrid.io.readers.source import AGAIN, Source, opened
 from illumgrid.io.readers.stored import Stored, Wanted
@@ -21,11 +22,14 @@ GIPL_HEADER = 256
 
 
 def read(source: Source, wanted: Wanted) -> Stored:
-    """Read a GIPL or HDF5 file; a gzipped one is unpacked into a temporary folder first."""
+    """Read a GIPL or HDF5 file; a gzipped one is unpacked into a temporary folder first.
+
+    What killed processes left there goes first.
+    """
     if not source.packed:
         return _read(source, source.file)
-    with TemporaryDirectory(prefix="illumgrid-") as folder:
-        inner = Path(folder) / f"inner{source.ending}"
+    with disk.beside(Path(gettempdir()) / "illumgrid-unpacked") as folder:
+        inner = folder / f"new{source.ending}"
         most = min(source.most, _promised(source))
         with opened(source) as packed, open(inner, "wb") as out:
             while chunk := packed.read(CHUNK):

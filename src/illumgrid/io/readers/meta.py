@@ -54,7 +54,9 @@ def read(source: Source, wanted: Wanted) -> Stored:
         channel = pick(wanted.channel, "channel", [""] * channels)
         check_axes(sizes[:3])
         spans = [single(channel), *wanted.spans(sizes[:3]), single(time)][: 1 + len(sizes)]
-        values, more = _data(source, stream, fields, names, np.dtype(order + TYPES[kind]), (channels, *sizes), spans)
+        values, more = _data(
+            source, stream, fields, names, np.dtype(order + TYPES[kind]), (channels, *sizes), spans, wanted.follow
+        )
     intensity = [
         float(fields.get(f"ElementToIntensityFunction{part}", none)) for part, none in (("Slope", 1), ("Offset", 0))
     ]
@@ -138,7 +140,7 @@ def _place(fields: Fields, axes: int) -> tuple[tuple[NDArray[Any], NDArray[Any]]
 
 def _data(
     source: Source, stream: IO[bytes], fields: Fields, names: list[str], dtype: np.dtype[Any], shape: tuple[int, ...],
-    wanted: Sequence[Span],
+    wanted: Sequence[Span], follow: bool,
 ) -> tuple[NDArray[Any], int]:  # fmt: skip
     """The values, in the order of the file (channel, x, y, z ...), and how many bytes follow them."""
     named = fields["ElementDataFile"]
@@ -164,10 +166,10 @@ def _data(
     if len(names) > 1 and len(names) != shape[-1]:
         raise BadInput(f"its data are in {len(names)} files, but it has {shape[-1]} slices; expected one each; mend it")
     if len(names) == 1:
-        file = beside(source, names[0])
+        file = beside(source, names[0], follow)
         with opened(file) as data:
             return part(file, data, False, wanted)
-    files, more = [beside(source, name) for name in names], [0]
+    files, more = [beside(source, name, follow) for name in names], [0]
     check_memory(need(dtype, shape, wanted))
 
     def slice_of(number: int) -> NDArray[Any]:

@@ -74,7 +74,7 @@ def read(source: Source, wanted: Wanted) -> Stored:
         order = ">" if fields.get("endian", "little").lower() == "big" else "<"
         kept = wanted.spans([sizes[axis] for axis in spatial])
         spans = [single(chosen[axis]) if axis in chosen else kept[spatial.index(axis)] for axis in range(axes)]
-        values, more = _data(source, stream, fields, names, np.dtype(order + TYPES[kind]), sizes, spans)
+        values, more = _data(source, stream, fields, names, np.dtype(order + TYPES[kind]), sizes, spans, wanted.follow)
     units = re.findall(r'"([^"]*)"', fields.get("space units", fields.get("units", "")))
     unit = next((LENGTHS.get(unit.lower(), unit) for unit in units if unit), None)
     medical = fields.get("space", "").lower().removesuffix("-time") in TO_LPS
@@ -240,7 +240,7 @@ def _spacing(
 
 def _data(
     source: Source, stream: IO[bytes], fields: Fields, names: list[str], dtype: np.dtype[Any], sizes: tuple[int, ...],
-    wanted: Sequence[Span],
+    wanted: Sequence[Span], follow: bool,
 ) -> tuple[NDArray[Any], int]:  # fmt: skip
     """The values with the axes of the file, and how many bytes follow them."""
     encoding = fields.get("encoding", "").lower()
@@ -280,12 +280,12 @@ def _data(
         return part(source, stream, wanted)
     names = names or _pattern(named) or [named]
     if len(names) == 1:
-        file = beside(source, names[0])
+        file = beside(source, names[0], follow)
         with opened(file) as data:
             return part(file, data, wanted)
     if len(names) != sizes[-1]:
         raise BadInput(f"its data are in {len(names)} files, but it has {sizes[-1]} slices; expected one each; mend it")
-    files, more = [beside(source, name) for name in names], [0]
+    files, more = [beside(source, name, follow) for name in names], [0]
     check_memory(need(dtype, sizes, wanted))
 
     def slice_of(number: int) -> NDArray[Any]:

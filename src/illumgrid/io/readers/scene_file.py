@@ -39,10 +39,10 @@ def read_scene(path: str | os.PathLike[str], *, smoothing: float = 0.0) -> Scene
         reads, relative to this file), or `points` with `spacing`, `sigma` and perhaps `weights`, `columns`, `cell` (see
         `density`), and perhaps `albedo`, `emission`, `range`, `inside`, `falling`, `signed` (true:
         two fields, ``NAME-positive`` where h >= c and ``NAME-negative`` where h <= -c), and the options of
-        `read_volume` (`spacing`, `channel`, `time`, `array`, `label`, `crop`, `downsample`); ``[[quad]]`` with `name`,
-        `corner`, `edge_u`, `edge_v` and perhaps `albedo`, `emission`, `texels`, `light`; ``[[light]]`` with `name` and
-        either `radiance`, or `nadir` and `zenith`, or `image`, or `direction`, `angle` and `irradiance`, see `Sky` and
-        `Distant`; ``[background]`` with `radiance`. What
+        `read_volume` (`spacing`, `channel`, `time`, `array`, `label`, `crop`, `downsample`, `follow`); ``[[quad]]``
+        with `name`, `corner`, `edge_u`, `edge_v` and perhaps `albedo`, `emission`, `texels`, `light`; ``[[light]]``
+        with `name` and either `radiance`, or `nadir` and `zenith`, or `image`, or `direction`, `angle` and
+        `irradiance`, see `Sky` and `Distant`; ``[background]`` with `radiance`. What
         is left out has the default of `Field`, `Material`, `Quad` or `Scene`.
     smoothing : float, optional
         Standard deviation, in voxels, of a Gaussian that blurs every field before anything else.
@@ -166,6 +166,7 @@ _READING: Mapping[str, Take] = {
     "label": _whole,
     "crop": _numbers(6, "six whole numbers in brackets (first and last + 1 along x, y, z)", int, 2**31),
     "downsample": _whole,
+    "follow": _yes,
 }
 """What `read_volume` takes."""
 

@@ -108,8 +108,8 @@ def seekable(source: Source) -> Iterator[IO[bytes]]:
     yield whole
 
 
-def beside(source: Source, named: str) -> Source:
-    """A file that a header names, in the folder of the header or below it; no other place is looked at.
+def beside(source: Source, named: str, follow: bool = False) -> Source:
+    """A file that a header names, in the folder of the header or below it; elsewhere only if `follow` allows.
 
     It is taken as it is: whether it is packed the header says.
     """
@@ -117,23 +117,19 @@ def beside(source: Source, named: str) -> Source:
     if not named or "\0" in named:
         raise BadInput(f"its header names the data file {named!r}; expected a file beside it; mend the header")
     place = folder / named
-    if (
-        (place.is_absolute() and Path(named).is_absolute())
-        or ".." in Path(named).parts
-        or "\\" in named
-        or ":" in named[:2]
-    ):
+    outside = Path(named).is_absolute() or ".." in Path(named).parts or "\\" in named or ":" in named[:2]
+    if outside and not follow:
         raise BadInput(
             f"its header names the data file {named!r}, which is not in the folder of the header; expected a file "
-            "beside it; copy the data there and write only its name into the header"
+            "beside it; copy the data there and write only its name into the header, or allow it with --follow"
         )
     try:
         if not place.exists():
             raise BadInput(f"its data should be in {named}, which is not there; expected both files; copy both")
-        if not place.resolve().is_relative_to(folder.resolve()):
+        if not follow and not place.resolve().is_relative_to(folder.resolve()):
             raise BadInput(
                 f"its data file {named} is a link to a place outside the folder of the header; expected a file beside "
-                "it; copy the data there"
+                "it; copy the data there, or allow it with --follow"
             )
         return find_source(place, whole=False)
     except OSError as problem:

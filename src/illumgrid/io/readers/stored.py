@@ -28,6 +28,8 @@ class Wanted:
     array: Choice = None
     crop: Sequence[int] | None = None
     downsample: int | None = None
+    follow: bool = False
+    """Read data files outside the folder of the header that names them."""
 
     def spans(self, shape: Sequence[int]) -> list[Span]:
         """What is kept of the axes x, y and z of a volume; refused where that cannot be."""
