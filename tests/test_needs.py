@@ -77,6 +77,6 @@ def test_the_library_info_and_export_refuse_as_well(refuse, tmp_path, free):
     with pytest.raises(BadInput, match=r"the run needs .* cut or downsample the volume"):
         ig.run(Scene.sky(ball(10)), paths=1)
     with pytest.raises(BadInput, match=r"the file needs .* leave out --on field"):
-        exports.write(light, tmp_path / "a.vti", on="field")
-    assert not (tmp_path / "a.vti").exists()
+        exports.write(light, tmp_path / "a.exr", on="field")
+    assert not (tmp_path / "a.exr").exists()
     refuse("info", "v.npy", words=["info needs", "--downsample"])

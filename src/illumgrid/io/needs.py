@@ -18,11 +18,13 @@ if TYPE_CHECKING:
     from illumgrid.field.scene import Field, Levels, Scene
 
 TO_DESCRIBE = 21
-"""Bytes a voxel for the histogram, plateaus and warnings of a volume that is read."""
+"""Bytes a voxel for the histogram, plateaus and warnings of a volume that is read; of a large one, see `of_field`."""
 TO_LIGHT = 44
-"""Bytes a voxel for diagnosis, preparation and writing of a field."""
-TO_EXPORT = 75
-"""Bytes a point for all arrays in one file."""
+"""Bytes a voxel for diagnosis, preparation and writing of a field; of a large one, see `of_field`."""
+TO_EXPORT = 24
+"""Bytes a point for the arrays of a .exr file; the other formats are written a part at a time."""
+_PARTS, _BRICKS = 1 << 24, 3
+"""Voxels of a field of which all are looked at together; bytes for each further one, those of its bricks."""
 TO_DEPOSIT = 18
 """Bytes a voxel for the density of points."""
 TO_EXTRACT = 16
@@ -41,6 +43,11 @@ def check(what: str, need: float, todo: str) -> None:
         raise BadInput(f"{what} needs {gigabytes(int(need))} of memory, {gigabytes(free)} are free; {todo}")
 
 
+def of_field(voxels: int, each: int) -> float:
+    """Bytes for a field that takes `each` a voxel: a large one is looked at in parts."""
+    return each * min(voxels, _PARTS) + _BRICKS * max(0, voxels - _PARTS)
+
+
 def check_run(scene: "Scene", specs: Sequence[GridSpec], levels: "Levels", density: float = 1.0) -> None:
     """Refuse a run whose nodes, walls and fields do not fit, and say which grid would.
 
@@ -48,7 +55,7 @@ def check_run(scene: "Scene", specs: Sequence[GridSpec], levels: "Levels", densi
     """
     channels = len(channels_of(scene))
     each = _QUERY + _CHANNEL * channels
-    fixed = sum(TO_LIGHT * prod(field.volume.shape) for field in scene.fields)
+    fixed = sum(of_field(prod(field.volume.shape), TO_LIGHT) for field in scene.fields)
     fixed += each * len(levels.table) * sum(prod(quad.texels) for quad in scene.quads)
     nodes = sum(
         prod(spec.shape) * (8 * (channels + 1) * density**3 + each * _share(field))

@@ -129,8 +129,9 @@ def write(
         return f"isosurface {level} of {lit.field!r}, {count} triangles, exposure {lit.exposure:.4g}"
     names = (array or "irradiance",) if ending == ".nrrd" else arrays.NAMES
     lattice = light.grids[number].spec if on != "field" else light.scene.fields[number].volume
-    todo = "leave out --on field, or write a .nrrd, which holds one array"
-    needs.check("the file", needs.TO_EXPORT * math.prod(lattice.shape) * len(names) / len(arrays.NAMES), todo)
+    if ending == ".exr":
+        todo = "leave out --on field, or write a .vti, which is written a part at a time"
+        needs.check("the file", needs.TO_EXPORT * math.prod(lattice.shape), todo)
     points = arrays.points_of(light, number, on or "grid", names)
     with disk.fresh_file(path) as fresh:
         LATTICES[ending](fresh, points, progress)
@@ -153,7 +154,6 @@ def write_field(
 ) -> None:
     """Write a field without light to a `.nrrd`, `.vti` or `.npz`, as the array "field"; whole, or not at all."""
     check_field(path)
-    needs.check("the file", needs.TO_EXPORT * math.prod(volume.shape) / len(arrays.NAMES), "choose a larger spacing")
     points = arrays.field_alone(volume, name)
     with disk.fresh_file(path) as fresh:
         FIELDS[Path(path).suffix.lower()](fresh, points, progress)
