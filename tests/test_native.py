@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 
 import illumgrid as ig
+import illumgrid.show.engines
+from illumgrid import show
 from illumgrid.backends.reference import Reference
 from illumgrid.field import bricks, levelset
 from illumgrid.field.boundaries import suggest_magnitudes, suggest_range
@@ -121,3 +123,11 @@ def test_fields_of_several_types_are_promoted_to_one_that_holds_them_and_no_volu
     every = marchable(Scene(fields))
     assert every.values.dtype == np.float32
     assert np.array_equal(every.values[every.start[3] :], wide.values.ravel())
+
+
+def test_a_large_field_is_drawn_by_rays(call, monkeypatch):
+    call("run", "v.npy", "--range", "0.3", "0.9", "--grid", "6", "--paths", "2", "--no-preview", "-o", "out")
+    monkeypatch.setattr(show.engines, "choose_engine", lambda name: ("egl", "as a test says"))
+    monkeypatch.setattr(show, "choose_engine", lambda name: ("egl", "as a test says"), raising=False)
+    monkeypatch.setattr(show.engines, "_LARGE", 100)
+    assert "drawn by the engine software: the field is large" in call("preview", "out", "--output", "a.png")

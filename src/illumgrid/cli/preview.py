@@ -139,6 +139,8 @@ def preview(
     engine_used, why = show.choose_engine(engine if exact is None else "software")
     gathered = None if exact is None else _exact(exact)
     light = relit(loaded(folder), weights, sky, turn)
+    if engine == "auto" and engine_used != "software" and show.too_large_for_meshes(light.scene):
+        engine_used, why = "software", "the field is large, and rays need no mesh of it"
     options: dict[str, Any] = {"background": background, "engine": engine_used, "stops": exposure}
     if size != SIZE:
         options |= {"width": size[0], "height": size[1]}

@@ -6,18 +6,18 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from illumgrid.field.upright import UPS
     from illumgrid.show.camera import VIEWS, Camera, fit_camera, widest_row
-    from illumgrid.show.engines import ENGINES, choose_engine
+    from illumgrid.show.engines import ENGINES, choose_engine, too_large_for_meshes
     from illumgrid.show.picture import grid_volume, png, render, strip
     from illumgrid.show.shade import BACKGROUND, CAP_TONE
 
 __all__ = [
     "BACKGROUND", "CAP_TONE", "ENGINES", "UPS", "VIEWS", "Camera", "choose_engine", "fit_camera", "grid_volume", "png",
-    "render", "strip", "widest_row",
+    "render", "strip", "too_large_for_meshes", "widest_row",
 ]  # fmt: skip
 
 _HOMES = {
     "show.camera": ("VIEWS", "Camera", "fit_camera", "widest_row"),
-    "show.engines": ("ENGINES", "choose_engine"),
+    "show.engines": ("ENGINES", "choose_engine", "too_large_for_meshes"),
     "show.picture": ("grid_volume", "png", "render", "strip"),
     "show.shade": ("BACKGROUND", "CAP_TONE"),
     "field.upright": ("UPS",),

@@ -1,9 +1,22 @@
 """What draws: OpenGL where there is one, else the package's own kernels."""
 
+from typing import TYPE_CHECKING
+
 from illumgrid.errors import BadInput
 from illumgrid.show.engines import gl
 
+if TYPE_CHECKING:
+    from illumgrid.field.scene import Scene
+
 ENGINES = ("auto", "egl", "osmesa", "software")
+
+
+_LARGE = 1 << 26  # voxels; extraction holds each in single precision, and millions of triangles
+
+
+def too_large_for_meshes(scene: "Scene") -> bool:
+    """Whether rays draw a scene in much less memory than triangles."""
+    return sum(field.volume.values.size for field in scene.fields) > _LARGE
 
 
 def choose_engine(name: str) -> tuple[str, str]:
