@@ -1,6 +1,7 @@
 """Choices for a picture: exposure, ground, up, roll, the camera of another picture, strips, scale bars, large sizes."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ from PIL import Image
 
 import illumgrid as ig
 from illumgrid.errors import BadInput
+from illumgrid.field.lights import Sky
 from illumgrid.field.scene import Scene
 from illumgrid.field.upright import axes_of, up_of
 from illumgrid.field.volume import Volume
@@ -243,6 +245,8 @@ def test_the_window_turns_about_what_it_shows(monkeypatch):
     offset = np.asarray(Plotter.camera.focal_point) - centre
     seen = fit_camera(scene, np.array([0.6]), 1.0)
     assert abs(offset @ seen.forward) < 0.1  # at the depth of the middle of the ball, not of its volume's first voxel
+    window._look(0.6, 1.0, "-x")
+    assert np.asarray(Plotter.camera.up) @ [-1, 0, 0] > 0.9
 
 
 def test_a_ground_under_the_open_sky_fades_and_walls_do_not():
@@ -255,3 +259,32 @@ def test_a_ground_under_the_open_sky_fades_and_walls_do_not():
     middle, outer, corner = cover(Scene.floor(volume, range=(4, 9)))
     assert middle == 1 and 0 < outer < 1 and corner == 0
     assert (cover(Scene.box(volume, range=(4, 9))) == 1).all()
+
+
+# Light, as options choose it
+
+
+def test_weights_on_the_command_line_are_those_of_mix(call):
+    call(*RUN)
+    call("preview", "out", *SMALL, "--light", "key=0.5", "--light", "dome=3", "-o", "mixed.png")
+    light = ig.load("out")
+    wanted = render(light.mix(key=0.5, dome=3), width=64, height=48)
+    assert np.array_equal(opened("mixed.png")[0], wanted)
+    assert np.abs(wanted.astype(int) - render(light, width=64, height=48)).max() > 10
+
+
+def test_a_sky_and_its_turn_on_the_command_line_are_those_of_under(call):
+    """A sky whose left half shines, as a Radiance picture: turned by 180 degrees, the right half does."""
+    pixels = np.zeros((4, 8, 4), np.uint8)
+    pixels[:, :4] = 128, 128, 128, 129  # 128/256 · 2
+    header = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 4 +X 8\n"
+    Path("sky.hdr").write_bytes(header + pixels.tobytes())
+    call(*RUN, "--lights", "sh", "--degree", 1)
+    light, image = ig.load("out"), np.zeros((4, 8, 3))
+    image[:, :4] = 1.0
+    for turn, shining in ((0, image), (180, image[:, ::-1])):
+        call("preview", "out", *SMALL, "--sky", "sky.hdr", "--turn", turn, "-o", "turned.png")
+        wanted = render(light.under(Sky("sky", shining)), width=64, height=48)
+        assert np.abs(opened("turned.png")[0].astype(int) - wanted).max() <= 1
+    call("preview", "out", *SMALL, "--turn", 90, "-o", "own.png")
+    assert np.array_equal(opened("own.png")[0], render(light.under(None, 90), width=64, height=48))

@@ -206,7 +206,7 @@ class Illumination:
             lit.visual = type(visual)(lit, vertex_colors=self.color(points, field))
         return lit
 
-    def show(self, isovalue: float | None = None, height: int = 520) -> Any:
+    def show(self, isovalue: float | None = None, height: int = 520, up: str | None = None) -> Any:
         """View in a notebook: the interactive page, with its isovalue as a synced trait.
 
         Parameters
@@ -215,6 +215,8 @@ class Illumination:
             Of the first field; by default the middle of the range. Later: ``view.isovalue = ...``.
         height : int
             Pixels.
+        up : {"x", "y", "z", "-x", "-y", "-z"}, optional
+            World direction that is up; by default that of the still pictures.
 
         Returns
         -------
@@ -228,7 +230,7 @@ class Illumination:
         """
         from illumgrid.show.viewer.widget import widget
 
-        return widget(self, isovalue, height)
+        return widget(self, isovalue, height, up)
 
     def _repr_png_(self) -> bytes:
         """Still picture, as a notebook shows it."""

@@ -34,13 +34,13 @@ def view(
 
     if export is not None and export.suffix.lower() not in (".html", ".htm"):
         raise BadInput(f"--export is {export.name!r}; expected a file name that ends in .html")
-    if desktop and (export is not None or no_open or up is not None):
-        raise BadInput("--desktop came with --export, --no-open or --up; expected it alone")
+    if desktop and (export is not None or no_open):
+        raise BadInput("--desktop came with --export or --no-open; expected it without them")
     light = relit(loaded(folder), weights, sky, turn)
     if desktop:
         from illumgrid.show.viewer.desktop import show
 
-        show(light)
+        show(light, up)
         return
     from illumgrid.show.viewer import page
 

@@ -17,7 +17,7 @@ PARTS = {
     "bounces": ("truncated bounces", "#e0a030"),
 }
 SHOWN = 10
-"""Contestants with a colour of their own; the others are grey."""
+"""Contestants with a colour and a line of the legend of their own; the others are grey dots."""
 
 COLUMNS = 4
 """Of the legend."""
@@ -30,7 +30,7 @@ def draw(records: Sequence[dict[str, Any]], shares: Sequence[dict[str, Any]], ti
     """Figure with the race on the left, and where the error of the direct way comes from on the right."""
     from matplotlib.figure import Figure
 
-    rows = -(-(len({r["contestant"] for r in records}) + 1) // COLUMNS)
+    rows = -(-(min(SHOWN + 1, len({r["contestant"] for r in records})) + 3) // COLUMNS)
     figure = Figure(figsize=(13, 6 + 0.17 * rows), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=(1.55, 1))
     race(left, records)
@@ -58,7 +58,8 @@ def race(axes: "Axes", records: Sequence[dict[str, Any]]) -> None:
         color = COLORS[k % len(COLORS)] if k < SHOWN else "#bbbbbb"
         sure = [r for r in own if r["front"] and r["rmse_spread"] is not None]
         axes.plot([r["seconds"] for r in own], [100 * r["rmse"] for r in own], linestyle="none", color=color,
-                  marker=MARKERS[k % len(MARKERS)], markersize=6, alpha=0.9, zorder=3, label=name)  # fmt: skip
+                  marker=MARKERS[k % len(MARKERS)] if k < SHOWN else ".", markersize=6, alpha=0.9, zorder=3,
+                  label=name if k < SHOWN else f"{len(names) - SHOWN} others" if k == SHOWN else None)  # fmt: skip
         axes.errorbar([r["seconds"] for r in sure], [100 * r["rmse"] for r in sure],
                       xerr=[r["seconds_spread"] for r in sure], yerr=[100 * r["rmse_spread"] for r in sure],
                       fmt="none", ecolor="black", elinewidth=1, capsize=2, zorder=4)  # fmt: skip

@@ -23,9 +23,11 @@ class Window:
     light : Illumination
     off_screen : bool
         Draw, but open no window.
+    up : str, optional
+        World direction that is up at first, as in `illumgrid.show.fit_camera`.
     """
 
-    def __init__(self, light: Illumination, off_screen: bool = False) -> None:
+    def __init__(self, light: Illumination, off_screen: bool = False, up: str | None = None) -> None:
         try:
             import pyvista
         except ImportError as reason:
@@ -39,18 +41,18 @@ class Window:
         low, high = map(float, field.range)
         self.plotter = self._pyvista.Plotter(off_screen=off_screen, title="illumgrid", window_size=[1100, 800])
         self.plotter.set_background([float(c) / 255 for c in encode_srgb(np.full(3, BACKGROUND))])
-        self._look((low + high) / 2, 1100 / 800)
+        self._look((low + high) / 2, 1100 / 800, up)
         self.sweep((low + high) / 2)
         self.plotter.add_slider_widget(
             self.sweep, (low, high), title=f"isovalue of {field.name}", interaction_event="always", fmt="%.4g",
             pointa=(0.25, 0.08), pointb=(0.75, 0.08), color="white", style="modern",
         )  # fmt: skip
 
-    def _look(self, isovalue: float, aspect: float) -> None:
+    def _look(self, isovalue: float, aspect: float, up: str | None = None) -> None:
         """The camera of the still picture, which turns about the middle of what it shows."""
         scene = self.light.scene
         row = scene.levels_through(0, isovalue)[0]
-        seen, outline = fit_camera(scene, row, aspect), outline_of(scene, row)
+        seen, outline = fit_camera(scene, row, aspect, up=up), outline_of(scene, row)
         middle = (outline.min(axis=0) + outline.max(axis=0)) / 2
         camera = self.plotter.camera
         camera.position = seen.eye
@@ -81,6 +83,6 @@ class Window:
         self.plotter.render()
 
 
-def show(light: Illumination) -> None:
-    """Open a window and return when it is closed."""
-    Window(light).plotter.show()
+def show(light: Illumination, up: str | None = None) -> None:
+    """Open a window and return when it is closed; `up` as in `Window`."""
+    Window(light, up=up).plotter.show()

@@ -53,14 +53,14 @@ def _widget_class() -> type[Any]:
     return View
 
 
-def widget(light: Illumination, isovalue: float | None = None, height: int = 520) -> Any:
+def widget(light: Illumination, isovalue: float | None = None, height: int = 520, up: str | None = None) -> Any:
     """A widget that shows `light`; see `Illumination.show`."""
     import json
 
     view = _widget_class()
     from illumgrid.show.viewer.packing import kept_apart, packed
 
-    scene, data = packed(light)
+    scene, data = packed(light, up)
     low, high = map(float, light.scene.fields[0].range)
     made = view(
         height=height,
