@@ -30,14 +30,12 @@ NO_ROULETTE = 1 << 20
 STEP = np.uint64(0x9E3779B97F4A7C15)
 
 
-class Numbers:
-    """What Mitsuba's integrators take for a sampler: random numbers as a pure function of a key for each path."""
+class Numbers(mi.Sampler):
+    """Random numbers for Mitsuba's integrators, a pure function of a key for each path."""
 
-    DRJIT_STRUCT = {"key": mi.UInt64, "count": mi.UInt64}  # noqa: RUF012
-
-    def __init__(self, key=None, count=None):
-        self.key = mi.UInt64(0) if key is None else key
-        self.count = mi.UInt64(0) if count is None else count
+    def __init__(self, key):
+        super().__init__(mi.Properties())
+        self.key, self.count = mi.UInt64(key), mi.UInt64(0)
 
     def next_1d(self, active=True):
         """A uniform number: the finalizer of `illumgrid.rng.mix`, whose upper 24 bits single precision holds."""
@@ -298,7 +296,7 @@ class MitsubaTracer:
         """Radiance along rays, from at most `depth` segments."""
         kind = "prbvolpath" if self.backend.medium else "prb"
         integrator = mi.load_dict({"type": kind, "max_depth": depth, "rr_depth": NO_ROULETTE})
-        sampler = Numbers(mi.UInt64(key))
+        sampler = Numbers(key)
         light, *_ = integrator.sample(
             mode=dr.ADMode.Primal, scene=scene, sampler=sampler, ray=ray, δL=None, state_in=None, active=active
         )

@@ -56,17 +56,15 @@ def furnace(bsdf="", medium="", bounces=64):
     ("bsdf", "medium"),
     [
         ("dielectric", ""),
-        ('{"type": "roughdielectric", "alpha": 0.2}', ""),
+        ('{"type": "dielectric", "int_ior": 2.4}', ""),
         ("", '{"type": "homogeneous", "albedo": 1.0, "sigma_t": 2.0}'),
     ],
 )
 def test_what_takes_no_light_leaves_a_furnace_as_it_is(bsdf, medium):
-    # Radiance 1 from everywhere stays 1 in glass and in a medium that only scatters; a rough surface with single
-    # scattering loses what would scatter twice, less than 3 % at this roughness (Heitz et al. 2016).
+    # Radiance 1 from everywhere stays 1 in glass, and in a medium that only scatters.
     answer = furnace(bsdf, medium)
     light = (answer.mean * ALBEDO).mean() / np.pi
-    lost = 0.03 if "rough" in bsdf else 1e-3
-    assert (answer.paths > 0).all() and 1 - lost - 4 * (answer.stderr * ALBEDO).mean() / np.pi / 8 < light < 1 + 2e-3
+    assert (answer.paths > 0).all() and abs(light - 1) < 4 * (answer.stderr * ALBEDO).mean() / np.pi / 8 + 2e-3
 
 
 def test_glass_without_refraction_casts_no_shadow_and_a_black_ball_does():
@@ -79,7 +77,7 @@ def test_glass_without_refraction_casts_no_shadow_and_a_black_ball_does():
     )
     clear = Mitsuba(bsdf='{"type": "dielectric", "int_ior": 1.0, "ext_ior": 1.0}')
     light = clear.solve(scene, asked, paths=range(512), bounces=8, seed=0)
-    assert np.allclose(light.mean, np.pi, atol=1e-3)
+    assert np.abs(light.mean - np.pi).max() < 4 * light.stderr.max()
     # Light that is reflected by the white ball comes from the black floor, or from the sky above.
     assert (
         Mitsuba().solve(scene, asked, paths=range(512), bounces=0, seed=0).mean.max()
