@@ -7,6 +7,9 @@ from typing import ClassVar
 
 from illumgrid.stages import hookimpl
 
+OLDEST_LLVM = 16
+"""With LLVM 15 the code of Mitsuba 3.9 ends the process: `fmaximum` cannot be selected."""
+
 
 @dataclass(frozen=True)
 class Mitsuba:
@@ -41,8 +44,11 @@ class Mitsuba:
             return "pip install mitsuba"
         import drjit
 
-        if not drjit.has_backend(drjit.JitBackend.LLVM):
-            return "install LLVM's library, such as libllvm19 of Debian, or name it by DRJIT_LIBLLVM_PATH"
+        there = drjit.has_backend(drjit.JitBackend.LLVM)
+        found = drjit.detail.llvm_version()[0] if there else 0
+        if found < OLDEST_LLVM:
+            came = f"version {found} was found" if there else "none was found"
+            return f"install LLVM {OLDEST_LLVM} or newer, such as libllvm19 of Debian ({came})"
         return None
 
     def prepare(self, scene):
