@@ -155,3 +155,6 @@ def test_what_killed_processes_unpacked_is_swept(tmp_path, monkeypatch):
     write(tmp_path / "a.gipl")
     assert np.array_equal(read_volume(zipped(tmp_path / "a.gipl")).values, values())
     assert not any((tmp_path / "temporary").iterdir())
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "nowhere"))
+    with pytest.raises(BadInput, match=r"cannot be unpacked into .*nowhere \(No such file or directory\); .* TMPDIR"):
+        read_volume(tmp_path / "a.gipl.gz")

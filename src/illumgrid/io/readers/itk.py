@@ -5,7 +5,7 @@ Each is opened by the reader of its own format, so that no other parser of ITK e
 
 import math
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from tempfile import gettempdir
 
@@ -28,16 +28,30 @@ def read(source: Source, wanted: Wanted) -> Stored:
     """
     if not source.packed:
         return _read(source, source.file)
-    with disk.beside(Path(gettempdir()) / "illumgrid-unpacked") as folder:
-        inner = folder / f"new{source.ending}"
-        most = min(source.most, _promised(source))
-        with opened(source) as packed, open(inner, "wb") as out:
-            while chunk := packed.read(CHUNK):
-                check_memory(out.tell() + len(chunk))
-                if out.tell() + len(chunk) > most + CHUNK:
-                    raise BadInput(f"unpacks to more than its header promises; {AGAIN}")
-                out.write(chunk)
+    place = Path(gettempdir())
+    with ExitStack() as until_read:
+        try:
+            inner = until_read.enter_context(disk.beside(place / "illumgrid-unpacked")) / f"new{source.ending}"
+            _unpack(source, inner)
+        except OSError as reason:
+            if reason.errno is None:  # of damaged data
+                raise
+            raise BadInput(
+                f"cannot be unpacked into {place} ({reason.strerror}); expected a folder with room for it; set TMPDIR "
+                "to another"
+            ) from None
         return _read(source, inner)
+
+
+def _unpack(source: Source, inner: Path) -> None:
+    """Unpack a file, no further than its header promises."""
+    most = min(source.most, _promised(source))
+    with opened(source) as packed, open(inner, "wb") as out:
+        while chunk := packed.read(CHUNK):
+            check_memory(out.tell() + len(chunk))
+            if out.tell() + len(chunk) > most + CHUNK:
+                raise BadInput(f"unpacks to more than its header promises; {AGAIN}")
+            out.write(chunk)
 
 
 def _promised(source: Source) -> int:

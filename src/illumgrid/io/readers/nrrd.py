@@ -1,5 +1,8 @@
 """NRRD (.nrrd, .nhdr), read strictly: header, raw, text, hex, gzip and bzip2 data, attached or in files beside it.
 
+pynrrd, which the tests read and write with, opens data files anywhere, unpacks without a bound, and takes what the
+header promises.
+
 References
 ----------
 .. [1] https://teem.sourceforge.net/nrrd/format.html
