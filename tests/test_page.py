@@ -7,11 +7,12 @@ import pytest
 
 from browser import HEIGHT, WIDTH, bent, browser, coloured, decoded, pair, still, until, with_separate_lights  # noqa: F401
 from illumgrid.field.lights import Distant
-from illumgrid.field.scene import Material
+from illumgrid.field.scene import Material, Scene
 from illumgrid.show import BACKGROUND, fit_camera
 from illumgrid.show.engines import software
 from illumgrid.show.shade import Shown, opaque
 from illumgrid.tone import decode_srgb
+from shapes import ball
 
 pytestmark = pytest.mark.filterwarnings("default")  # of the browser's driver
 KEY = Distant("key", (-1, -1, 1), 25, (3.0, 2.0, 1.0))
@@ -70,6 +71,16 @@ def test_sliders_mix_the_lights_at_the_exposure_of_the_first_picture(browser, sc
     browser.open(kept, page.url.partition("#")[2], anew=True)
     off = np.abs(browser.pixels() - moved).max(axis=2)[covered]
     assert np.median(off) <= 1 and np.quantile(off, 0.9) <= 3
+
+
+def test_a_ground_under_the_sky_fades_into_the_background_as_in_the_still_picture(browser, monkeypatch):  # noqa: F811
+    light = coloured(Scene.floor(ball(14), range=(0.5, 0.9), name="ground"))
+    wanted, address, _ = still(light, 0.5)
+    browser.open(light, address)
+    off = np.abs(browser.pixels() - wanted).max(axis=2)
+    assert np.median(off) <= 1 and np.quantile(off, 0.95) <= 4
+    monkeypatch.setattr("illumgrid.show.shade.fades", lambda scene, number: False)
+    assert np.mean(np.abs(still(light, 0.5)[0] - wanted).max(axis=2) > 10) > 0.05
 
 
 def test_a_run_of_one_light_has_no_slider_for_it(browser):  # noqa: F811

@@ -130,9 +130,9 @@ def test_a_page_holds_what_fits_and_says_what_it_leaves_out(monkeypatch):
     assert len(scene["fields"][0]["light"]["sky"]) == 25 and not any("components" in note for note in scene["notes"])
     lit = len(reachable(light.scene.fields[0], light.grids[0].spec))
     monkeypatch.setattr(skies, "MOST_BYTES", 2 * 8 * lit)
-    scene, small = packed(light)
+    scene, _ = packed(light)
     assert len(scene["fields"][0]["light"]["sky"]) == 8
     assert any("8 components for 25" in note and "%" in note for note in scene["notes"])
     monkeypatch.setattr(skies, "MOST_BYTES", 2 * 3 * lit)  # too few for six components: fewer nodes
-    scene, smaller = packed(light)
-    assert len(scene["fields"][0]["light"]["sky"]) == 6 and len(smaller) < len(small)
+    scene, _ = packed(light)
+    assert len(scene["fields"][0]["light"]["sky"]) >= 6 and np.prod(scene["fields"][0]["light"]["shape"]) < 9**3 / 2

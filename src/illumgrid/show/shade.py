@@ -92,7 +92,7 @@ class Shown:
 
     def fade(self, number: int, u: Floats, v: Floats) -> Colors:
         """Coverage (n,) of a quad at shares u, v (n,) of its edges: a ground under the open sky ends softly."""
-        if not self.scene.open or self.scene.quads[number].material.emission.any() or len(self.scene.quads) > 1:
+        if not fades(self.scene, number):
             return np.ones(len(u), np.float32)
         rim = np.hypot(2 * u - 1, 2 * v - 1)  # a disc within the quad
         share = np.clip((1.0 - rim) / 0.6, 0.0, 1.0)
@@ -100,6 +100,11 @@ class Shown:
 
     def _lamplit(self, color: Floats, facing: Floats) -> Colors:
         return curve(np.float32(2.0**self.stops * WHITE) * _facing(color, facing))
+
+
+def fades(scene: Scene, number: int) -> bool:
+    """Whether a quad is the ground under an open sky, which pictures let end softly."""
+    return scene.open and len(scene.quads) == 1 and not scene.quads[number].material.emission.any()
 
 
 def _facing(color: Floats, facing: Floats) -> Colors:

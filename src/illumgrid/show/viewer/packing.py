@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from illumgrid.errors import shown_range
 from illumgrid.field.layers import layers_of
+from illumgrid.field.lights import Harmonics
 from illumgrid.field.scene import Field, Scene
 from illumgrid.field.upright import axes_of, up_of
 from illumgrid.field.volume import Floats, Lattice, box_corners, histogram
@@ -20,7 +21,7 @@ from illumgrid.grid.nodes import reachable
 from illumgrid.light import Illumination
 from illumgrid.show import trust
 from illumgrid.show.camera import HALF_ANGLE, fit_camera, outline_of
-from illumgrid.show.shade import BACKGROUND, CAP_TONE
+from illumgrid.show.shade import BACKGROUND, CAP_TONE, fades
 from illumgrid.show.viewer import skies
 from illumgrid.show.viewer.arrays import (
     HOLE,
@@ -87,8 +88,8 @@ def kept_apart(light: Illumination) -> dict[str, float]:
 
 def _field(light: Illumination, number: int, stage: Stage, into: Bytes, notes: list[str]) -> dict[str, Any]:
     field, whole, sky = light.scene.fields[number], light.grids[number], skies.sky_of(light)
-    kept, share = skies.fitting(light, sky) if sky else (0, 1.0)
-    most = MOST_NODES if share == 1 else min(MOST_NODES, int(share * whole.support.size))
+    room = skies.room(light) if sky else np.inf
+    most = min(MOST_NODES, int(min(1.0, room / skies.FEWEST) * whole.support.size))
     volume, grid = reduced(field.volume, MOST_VOXELS), thinned(whole, most)
     sign = field.upward
     ends = sorted(sign * field.stored_range)
@@ -110,6 +111,7 @@ def _field(light: Illumination, number: int, stage: Stage, into: Bytes, notes: l
         lit = np.zeros(grid.spec.shape, bool)
         lit.flat[reachable(field, grid.spec)] = True
         held = skies.answers(light, sky, (grid.light.transpose(2, 1, 0, 3) * scale)[lit.T], grid.channels)
+        kept = _components(room * whole.support.size / grid.support.size, sky)
         shown["mask"] = into.add(np.packbits(lit.T.ravel(), bitorder="little").tobytes())
         shown["sky"], lost = skies.pack_sky(held, kept, into)
         _note_lost(notes, field.name, kept, len(sky.coefficients), lost)
@@ -142,6 +144,10 @@ def _mix(channels: Channels, light: NDArray[np.float32]) -> NDArray[np.float32]:
     return channels.shown(light) if channels.own else np.asarray(light @ np.array(channels.mix, np.float32))
 
 
+def _components(room: float, sky: Harmonics) -> int:
+    return int(np.clip(room, skies.FEWEST, len(sky.coefficients)))
+
+
 def _note_lost(notes: list[str], name: str, kept: int, of: int, lost: float) -> None:
     if lost:
         notes.append(
@@ -167,7 +173,7 @@ def _walls(light: Illumination, stage: Stage, into: Bytes) -> tuple[list[dict[st
     if not quads:
         return [], None
     scale, offset, described = light.exposure / np.pi, 0, []
-    for quad in quads:
+    for number, quad in enumerate(quads):
         nu, nv = quad.texels
         material = quad.material
         described.append(
@@ -177,6 +183,7 @@ def _walls(light: Illumination, stage: Stage, into: Bytes) -> tuple[list[dict[st
                 "edgeV": (quad.edge_v / stage.size).tolist(),
                 "normal": quad.normal.tolist(),
                 "texels": [nu, nv],
+                "fades": fades(light.scene, number),
                 "offset": [offset, 0],
                 "albedo": material.albedo.tolist(),
                 "emission": (material.emission * light.exposure).tolist(),
@@ -192,7 +199,7 @@ def _walls(light: Illumination, stage: Stage, into: Bytes) -> tuple[list[dict[st
     if sky := skies.sky_of(light):
         side = _beside([wall.light for wall in light.walls]).transpose(2, 1, 0, 3) * scale
         held = skies.answers(light, sky, side, light.walls[0].channels)
-        atlas["sky"], _ = skies.pack_sky(held, skies.fitting(light, sky)[0], into)
+        atlas["sky"], _ = skies.pack_sky(held, _components(skies.room(light), sky), into)
     return described, atlas
 
 

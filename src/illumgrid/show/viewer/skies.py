@@ -19,7 +19,7 @@ from illumgrid.grid.nodes import reachable
 from illumgrid.light import Illumination
 from illumgrid.show.viewer.arrays import Bytes, half_planes
 
-MOST_BYTES = 14_000_000
+MOST_BYTES = 18_000_000
 """Of the answers in one page, before compression: a grey field of 128³ voxels and a grid of 96³ nodes then stay under
 25 MB, whatever they hold."""
 FEWEST = 6
@@ -113,10 +113,9 @@ def pack_sky(held: Answers, most: int, into: Bytes) -> tuple[list[dict[str, Any]
     return planes, lost
 
 
-def fitting(light: Illumination, sky: Harmonics) -> tuple[int, float]:
-    """How many components fit a page, and by how much grids must be thinned before, as a share of their nodes."""
+def room(light: Illumination) -> float:
+    """How many components of all nodes that are lit, and of all texels, fit a page."""
     lit = sum(len(reachable(field, grid.spec)) for field, grid in zip(light.scene.fields, light.grids))
     texels = sum(wall.light[..., 0].size for wall in light.walls)
     colors = 1 if any(name.endswith(".Y") for name in light.grids[0].channels.names) else 3
-    room = MOST_BYTES / (2 * colors * max(lit + texels, 1))
-    return int(np.clip(room, FEWEST, len(sky.coefficients))), min(1.0, room / FEWEST)
+    return MOST_BYTES / (2 * colors * max(lit + texels, 1))

@@ -191,7 +191,7 @@ export class Picture {
         uCorner: wall.corner, uEdgeU: wall.edgeU, uEdgeV: wall.edgeV, uNormal: wall.normal,
         uTexels: wall.texels, uOffset: wall.offset,
         uRow: (state.sweep * (scene.atlas.shape[2] - 1) + 0.5) / scene.atlas.shape[2],
-        uAlbedo: wall.albedo, uEmission: wall.emission, uLocalColor: wall.localColor,
+        uAlbedo: wall.albedo, uEmission: wall.emission, uLocalColor: wall.localColor, uGround: wall.fades ? scene.background : -1,
       });
       gl.drawArrays(gl.TRIANGLE_STRIP, 0, 4);
     }

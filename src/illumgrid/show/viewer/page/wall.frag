@@ -5,11 +5,17 @@ uniform vec2 uTexels, uOffset;       // of this wall, within the texture of all
 uniform float uRow;                  // texture coordinate of the sweep
 uniform vec3 uAlbedo, uEmission;     // emission as the exposure shows it
 uniform vec3 uLocalColor;
+uniform float uGround;               // display radiance of the background, into which a floor under the sky fades; else below 0
 uniform sampler2D uFront;
 uniform bool uPeel;
 
 in vec3 vRay;
 in vec2 vPlace;
+
+void finish(vec3 color) {
+  float share = uGround < 0.0 ? 1.0 : smoothstep(0.0, 0.6, 1.0 - length(2.0 * vPlace - 1.0));
+  draw(mix(vec3(uGround), color, share), 1.0);
+}
 
 void main() {
   float depth = depthOf(length(vRay));
@@ -18,7 +24,7 @@ void main() {
   vec2 texel = uOffset + clamp(vPlace * uTexels, vec2(0.5), uTexels - 0.5);
   vec3 light = lightOf(texture(uWalls, vec3(texel / vec2(textureSize(uWalls, 0).xy), uRow)));
   float facing = abs(dot(uNormal, normalize(vRay)));
-  if (isTrust()) { draw(vec3(0.5 * uCapTone * facing), 1.0); return; }
-  if (isLocal()) draw(curve(uGain * uWhite * uLocalColor * facing), 1.0);
-  else draw(curve(uGain * (uAlbedo * light + uEmission)), 1.0);
+  if (isTrust()) finish(vec3(0.5 * uCapTone * facing));
+  else if (isLocal()) finish(curve(uGain * uWhite * uLocalColor * facing));
+  else finish(curve(uGain * (uAlbedo * light + uEmission)));
 }
