@@ -24,7 +24,7 @@ def cases():
 
 @pytest.mark.parametrize("name", verify.contenders())
 def test_a_backend_agrees_with_every_closed_form(name, cases):
-    paths = {"embree": 1 << 18, "reference": 1 << 18}.get(name, 1 << 20)
+    paths = {"embree": 1 << 17, "reference": 1 << 17}.get(name, 1 << 20)
     rows = list(check([name], paths=paths, seed=1, cases=cases))
     assert len(rows) == sum(not case.voxels or name in ("numba:levelset", "reference") for case in cases)
     assert all(row.agrees for row in rows), "\n".join(map(line, rows))

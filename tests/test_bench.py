@@ -39,6 +39,8 @@ from illumgrid.transport.stages import capabilities
 from illumgrid.transport.tracer import prepare
 from shapes import ball, refused, sky
 
+pytestmark = pytest.mark.judged
+
 BACKEND = Numba()
 SCENE = replace(Scene.sky(ball(14), range=(0.4, 0.9)), quads=Scene.floor(ball(14), range=(0.4, 0.9)).quads)
 TRACER = prepare(BACKEND, SCENE)

@@ -14,6 +14,8 @@ from illumgrid.accuracy.probe import Probe
 from illumgrid.backends.numba_ import Numba
 from shapes import ball, sky
 
+pytestmark = pytest.mark.judged
+
 QUICK = {"grid": 8, "paths": 4, "bounces": 1, "isovalues": 2, "judge": True}
 
 
