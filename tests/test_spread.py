@@ -7,7 +7,7 @@ import pytest
 
 import naive
 from illumgrid import rng
-from illumgrid.backends import kernels, reference
+from illumgrid.backends import kernels, spread
 
 U = np.uint64
 RANGES = range(1), range(2), range(1, 3), range(3), range(3, 40), range(7, 8), range(36), range(1, 140), range(512)
@@ -28,7 +28,7 @@ def net(paths, queries=2000):
 
 def stderr(worth, paths, sky=0.0, lamps=0.0):
     n = len(paths)
-    return np.sqrt(reference.spread(worth, paths.start, np.full(1, sky), np.full(1, lamps)) / (n * (n - 1)))
+    return np.sqrt(spread.spread(worth, paths.start, np.full(1, sky), np.full(1, lamps)) / (n * (n - 1)))
 
 
 @pytest.mark.parametrize("paths", RANGES, ids=str)
@@ -36,7 +36,7 @@ def stderr(worth, paths, sky=0.0, lamps=0.0):
 def test_three_implementations_agree(paths, sky, lamps):
     worth = np.random.default_rng(1).exponential(size=(len(paths), 3, 3)) ** 3
     worth[:, 2] = np.round(worth[:, 2], 1)
-    estimate = reference.spread(worth, paths.start, np.full(3, sky), np.full(3, lamps))
+    estimate = spread.spread(worth, paths.start, np.full(3, sky), np.full(3, lamps))
     for query in range(3):
         for c in range(3):
             loops = naive.spread(worth[:, query, c].tolist(), paths.start, sky, lamps)
@@ -49,11 +49,11 @@ def test_three_implementations_agree(paths, sky, lamps):
 def test_of_independent_worths_it_is_the_usual_one():
     random = np.random.default_rng(1).normal(size=(2048, 4000, 1))
     for paths in (range(2), range(1, 3), range(3), range(4, 12), range(4, 9)):
-        estimate = reference.sum_variance(random[: len(paths)], paths.start) / len(paths)
+        estimate = spread.sum_variance(random[: len(paths)], paths.start) / len(paths)
         assert abs(estimate.mean() - 1) < 6 * estimate.std() / math.sqrt(estimate.size)
     for paths, least in ((range(16), 0.82), (range(64), 0.88), (range(3, 40), 0.9), (range(2048), 0.965)):
         # Nets of a quarter of the size may be worse by chance, which is taken for a trend: up to a seventh is lost.
-        assert least < reference.sum_variance(random[: len(paths)], paths.start).mean() / len(paths) < 1.01
+        assert least < spread.sum_variance(random[: len(paths)], paths.start).mean() / len(paths) < 1.01
 
 
 def test_four_paths_by_hand():
@@ -69,8 +69,8 @@ def test_what_changes_along_one_number_is_no_noise(m):
     paths = range(2**m)
     u, v = net(paths, 10)
     worth = np.floor(u * 2 ** (m // 2 - 1)) ** 2 + np.exp(np.floor(v * 2 ** (m // 2 - 1)))
-    np.testing.assert_allclose(reference.net_variance(worth), 0, atol=1e-20)
-    assert (reference.net_variance(worth * np.random.default_rng(0).random(worth.shape)) > 0.1).all()
+    np.testing.assert_allclose(spread.net_variance(worth), 0, atol=1e-20)
+    assert (spread.net_variance(worth * np.random.default_rng(0).random(worth.shape)) > 0.1).all()
 
 
 @pytest.mark.parametrize(
@@ -115,6 +115,6 @@ def test_lamps_that_no_path_saw_count_and_so_does_the_brightest_path():
     np.testing.assert_allclose(stderr(np.zeros((64, 5, 1)), range(64), lamps=3.0), 3 / 64)
     worth = np.zeros((64, 1, 1))
     worth[7] = 8.0
-    nets = math.sqrt(reference.sum_variance(worth, 0).item()) / 64
+    nets = math.sqrt(spread.sum_variance(worth, 0).item()) / 64
     assert stderr(worth, range(64)).item() == pytest.approx(math.hypot(nets, (8 - 8 / 64) / 64, 0.2 / 64 * 8 / 64))
     assert stderr(worth, range(64), sky=8.0).item() == pytest.approx(math.hypot(nets, 0.2 / 64 * 8))

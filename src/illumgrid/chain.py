@@ -110,15 +110,7 @@ def run(
     IllumgridWarning
         When the scene has no light, or nodes within the range are holes.
     """
-    seed = _whole(seed, 0, 2**64, "the seed is {}; expected a whole number from 0 to 2**64 - 1")
-    if paths is not None:
-        paths = _whole(
-            paths, 1, 2**31, "{} paths were asked for; expected a whole number, at least 1 and fewer than 2**31"
-        )
-    if bounces is not None:
-        bounces = _whole(
-            bounces, 0, 2**31, "{} bounces were asked for; expected 0 (light straight from the lamps) to 2**31 - 1"
-        )
+    paths, bounces, seed = _whole_numbers(paths, bounces, seed)
     levels = level_table(scene, 32 if isovalues is None else isovalues)
     options = {}
     if isovalues is not None and isinstance(sampler, str) and "count" in registry.option_names("sampler", sampler):
@@ -176,6 +168,19 @@ def run(
     }
     light = Illumination(scene, levels, baked.grids, baked.walls, recipe)
     return judged(light, chosen[1], tracer) if judge else light
+
+
+def _whole_numbers(paths: Any, bounces: Any, seed: Any) -> tuple[int | None, int | None, int]:
+    """Check these options; numbers of any integer type become those of Python."""
+    if paths is not None:
+        paths = _whole(
+            paths, 1, 2**31, "{} paths were asked for; expected a whole number, at least 1 and fewer than 2**31"
+        )
+    if bounces is not None:
+        bounces = _whole(
+            bounces, 0, 2**31, "{} bounces were asked for; expected 0 (light straight from the lamps) to 2**31 - 1"
+        )
+    return paths, bounces, _whole(seed, 0, 2**64, "the seed is {}; expected a whole number from 0 to 2**64 - 1")
 
 
 def _whole(number: Any, least: int, limit: int, sentence: str) -> int:

@@ -13,12 +13,12 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from illumgrid.backends.lights_numpy import Ints
 from illumgrid.backends.mesh.bvh import unit_cube
 from illumgrid.backends.mesh.meshes import LevelMesh, Meshes, meshed, row_groups
 from illumgrid.backends.numba_ import pool, share
 from illumgrid.backends.reference import (
     Bools,
-    Ints,
     answer,
     cell_normal,
     gradient_normal,

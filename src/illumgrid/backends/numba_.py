@@ -5,6 +5,7 @@ import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
+from functools import cache
 from itertools import chain
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
@@ -162,7 +163,13 @@ def compiled(kernel: Any, surfaces: Any) -> bool:
 
 def pool(threads: int) -> ThreadPoolExecutor:
     """So many threads, 0 for one per processor. The caller's is not among them: it waits for Ctrl-C."""
-    return ThreadPoolExecutor(threads or cores())
+    return _pool(threads or cores(), os.getpid())
+
+
+@cache
+def _pool(threads: int, process: int) -> ThreadPoolExecutor:
+    """All tracers of a process share their threads; a forked process has none of its parent's."""
+    return ThreadPoolExecutor(threads)
 
 
 def share(

@@ -4,7 +4,6 @@ The path loop has the headings of `kernels.walk`; everything that Numba's kernel
 meet is handed in: the trilinear level set here, its mesh in `embree`.
 """
 
-import math
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, ClassVar, Literal, Protocol
@@ -12,6 +11,16 @@ from typing import Any, ClassVar, Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from illumgrid.backends.lights_numpy import (
+    Ints,
+    asked_radiance,
+    cosine_direction,
+    distant_density,
+    distant_direction,
+    lamp_density,
+    sky_seen,
+)
+from illumgrid.backends.spread import spread
 from illumgrid.constants import (
     BURIED,
     CAP,
@@ -24,21 +33,18 @@ from illumgrid.constants import (
     QUAD,
     SAME_ROW,
     SURFACE,
-    UNSEEN,
 )
 from illumgrid.field.levelset import Marchable
-from illumgrid.field.lights import basis
 from illumgrid.field.scene import Scene
 from illumgrid.field.volume import Floats, central_differences, unit
 from illumgrid.grid.cache import NO_CACHE, Cache
 from illumgrid.grid.channels import Channels
-from illumgrid.rng import draw, draw_pair, net_size, sharing, stream
+from illumgrid.rng import draw, draw_pair, stream
 from illumgrid.stages import Backend, hookimpl
 from illumgrid.transport.samples import Queries, Samples, in_frame, in_turn
 from illumgrid.transport.tracer import laid_out, solve_once
 
 Bools = NDArray[np.bool_]
-Ints = NDArray[np.int64]
 
 BATCH = 1 << 15  # rays that take a step together
 _CORNERS = np.array(list(np.ndindex(2, 2, 2)))
@@ -271,92 +277,6 @@ class Marching:
         return np.asarray(((u >= 0) & (u <= last)).all(axis=1) & (q[:, 0] >= 0))
 
 
-def cosine_direction(u1: Floats, u2: Floats, normal: Floats) -> Floats:
-    """Directions (n, 3) of density cosine / π about the normals."""
-    radius, angle = np.sqrt(u1), 2 * np.pi * u2
-    return about(radius * np.cos(angle), radius * np.sin(angle), np.sqrt(1 - u1), normal)
-
-
-def about(x: Floats, y: Floats, z: Floats, normal: Floats) -> Floats:
-    """Directions (n, 3) with these coordinates about normals; the frame by Duff et al., JCGT 6(1), 2017."""
-    nx, ny, nz = normal.T
-    sign = np.where(nz >= -1e-6, 1.0, -1.0)
-    a = -1 / (sign + nz)
-    b = nx * ny * a
-    tangent = np.stack([1 + sign * nx * nx * a, sign * b, -sign * nx], axis=1)
-    bitangent = np.stack([b, sign + ny * ny * a, -ny], axis=1)
-    local = np.stack([x, y, z])[:, :, None]
-    return np.asarray(local[0] * tangent + local[1] * bitangent + local[2] * normal)
-
-
-def lamp_density(scene: Marchable, q: Ints, distance: Floats, d: Floats) -> Floats:
-    """Density per solid angle (n,) with which lamps are asked at the points of quads q, at these distances along d."""
-    facing = -np.einsum("ij,ij->i", scene.quad_normal[q], d)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(facing > 0, scene.lamp_density[q] * distance * distance / facing, 0.0)
-
-
-def image_place(scene: Marchable, d: Floats) -> tuple[Floats, Floats]:
-    """Rows and columns (n,), fractions of pixels from their edges, at which the image holds directions (n, 3)."""
-    x, y, z = scene.sky_axes @ d.T
-    rows, columns = scene.image_density.shape
-    return rows * np.arccos(np.clip(z, -1, 1)) / np.pi, columns * (np.arctan2(x, y) / (2 * np.pi) + 0.5)
-
-
-def distant_direction(scene: Marchable, u: Floats) -> Floats:
-    """Directions (n, 3) in which to ask for distant light, from the numbers u (n, 3)."""
-    disc = np.minimum(np.searchsorted(scene.asked[2:], u[:, 2], side="right"), len(scene.disc_cosine) - 1)
-    result = np.zeros((len(u), 3))
-    pictured = u[:, 2] < scene.asked[1]
-    if not pictured.all():
-        z, angle = 1 - u[:, 0] * (1 - scene.disc_cosine[disc]), 2 * np.pi * u[:, 1]
-        radius = np.sqrt(np.maximum(0, 1 - z * z))
-        result[:] = about(radius * np.cos(angle), radius * np.sin(angle), z, scene.disc_axis[disc])
-    if pictured.any():
-        rows, columns = scene.image_density.shape
-        first, second = u[pictured, 0], u[pictured, 1]
-        edges = np.concatenate([[0.0], scene.image_rows])
-        i = np.searchsorted(scene.image_rows, first, side="right")
-        inner = np.column_stack([np.zeros(rows), scene.image_columns])[i]
-        j = (inner[:, 1:] <= second[:, None]).sum(axis=1)
-        down = (first - edges[i]) / (edges[i + 1] - edges[i])
-        low, high = (np.take_along_axis(inner, k[:, None], 1)[:, 0] for k in (j, j + 1))
-        top, bottom = np.cos(np.pi * i / rows), np.cos(np.pi * (i + 1) / rows)
-        z = top + down * (bottom - top)
-        azimuth = 2 * np.pi * ((j + (second - low) / (high - low)) / columns - 0.5)
-        level = np.sqrt(np.maximum(0, 1 - z * z))
-        result[pictured] = np.stack([level * np.sin(azimuth), level * np.cos(azimuth), z], axis=1) @ scene.sky_axes
-    return result
-
-
-def distant_density(scene: Marchable, d: Floats) -> Floats:
-    """Density per solid angle (n,) with which `distant_direction` finds directions (n, 3)."""
-    density = ((d @ scene.disc_axis.T >= scene.disc_cosine) * scene.disc_density).sum(axis=1)
-    if len(scene.image):
-        v, u = image_place(scene, d)
-        rows, columns = scene.image_density.shape
-        i, j = np.minimum(v.astype(int), rows - 1), np.minimum(u.astype(int), columns - 1)
-        density = density + scene.image_density[i, j]
-    return np.asarray(density)
-
-
-def asked_radiance(scene: Marchable, d: Floats) -> Floats:
-    """Radiance (n, C) of the image, bilinear, and of the discs along directions (n, 3)."""
-    light = (d @ scene.disc_axis.T >= scene.disc_cosine) @ scene.disc_radiance
-    if len(scene.image):
-        v, u = image_place(scene, d)
-        rows, columns = scene.image_density.shape
-        v, u = np.clip(v - 0.5, 0, rows - 1), u - 0.5
-        i, left = np.minimum(v.astype(int), rows - 2), np.floor(u).astype(int)
-        down, across = (v - i)[:, None], (u - left)[:, None]
-        ends = left % columns, (left + 1) % columns
-        upper, lower = (
-            (1 - across) * scene.image[i + k, ends[0]] + across * scene.image[i + k, ends[1]] for k in (0, 1)
-        )
-        light = light + (1 - down) * upper + down * lower
-    return np.asarray(light)
-
-
 def light_asked(
     surfaces: Surfaces, u: Floats, level: Floats, on: Ints, on_face: Ints, x: Floats, normal: Floats
 ) -> tuple[Floats, Floats]:
@@ -469,14 +389,8 @@ def walk(
 
         # A path that escapes sees the sky, and ends.
         escaped, away = alive[what == MISS], d[what == MISS]
-        worth[escaped] += keep[escaped] * scene.background
-        if len(scene.harmonics):
-            degree = math.isqrt(len(scene.harmonics)) - 1
-            worth[escaped] += keep[escaped] * (basis(degree, away @ scene.sky_axes.T) @ scene.harmonics)
-        if scene.asked[0] < 1:
-            by_cosine, by_light = np.einsum("ij,ij->i", normal[escaped], away) / np.pi, distant_density(scene, away)
-            weight = by_cosine / (by_cosine + by_light)
-            worth[escaped] += keep[escaped] * weight[:, None] * asked_radiance(scene, away)
+        for weight, light in sky_seen(scene, normal[escaped], away):
+            worth[escaped] += keep[escaped] * weight * light
 
         # A path inside a solid carries no light.
         goes_on = (what != MISS) & (what != BURIED)
@@ -510,52 +424,6 @@ def walk(
             goes_on &= ~ends
         alive = alive[goes_on]
     return worth
-
-
-def mixed_differences(worth: Floats, many: int) -> Floats:
-    """Variance (n, C) of a path as four of a net (paths, n, C) in one box tell it: `kernels.mixed_differences`."""
-    last = len(worth).bit_length() - 3
-    i, squarest = np.arange(len(worth) // 4), (last + 1) // 2
-    shapes = []
-    for a in range(max(0, squarest - 1), min(last, squarest - 2 + many) + 1):
-        first, second = sharing(a + 1, last - a), sharing(a, last - a + 1)
-        off = worth[i] - worth[i ^ first] - worth[i ^ second] + worth[i ^ first ^ second]
-        shapes.append((off**2).mean(axis=0) / 4)
-    return np.asarray(np.mean(shapes, axis=0))
-
-
-def net_variance(worth: Floats) -> Floats:
-    """Variance (n, C) of independent paths that would be as far off as a net (paths, n, C): `kernels.net_variance`."""
-    if len(worth) == 2:
-        return np.asarray((worth[0] - worth[1]) ** 2 / 2)
-    many = 2 if len(worth) > 64 and len(worth).bit_length() % 2 == 0 else 3
-    fine = mixed_differences(worth, many)
-    if len(worth) < 16:
-        return fine
-    coarse = np.mean([mixed_differences(part, many) for part in np.split(worth, 4)], axis=0)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(fine >= coarse, fine, np.maximum(0.5, fine / coarse) * fine)
-
-
-def sum_variance(worth: Floats, first: int) -> Floats:
-    """Variance (n, C) of the sum of paths (paths, n, C) number `first` on, as the nets in that range tell it."""
-    count, total, known, at = len(worth), np.zeros(worth.shape[1:]), 0, 0
-    while at < count:
-        size = net_size(first + at, count - at)
-        if size > 1:
-            total += size * net_variance(worth[at : at + size])
-            known += size
-        at += size
-    if known == 0 and count == 2:
-        total, known = (worth[0] - worth[1]) ** 2, 2
-    return np.asarray(total * count / max(known, 1))
-
-
-def spread(worth: Floats, first: int, sky: Floats, lamplight: Floats) -> Floats:
-    """The m2 (n, C) of the mean of paths (paths, n, C) number `first` on, in such light (C,): `kernels.moments`."""
-    count, usual = len(worth), np.maximum(worth.mean(axis=0), sky)
-    unseen = (UNSEEN * usual) ** 2 + np.maximum(0.0, worth.max(axis=0) - usual) ** 2 + lamplight**2
-    return np.asarray((sum_variance(worth, first) + unseen) * (count - 1) / count)
 
 
 def answer(

@@ -160,7 +160,7 @@ Meshed = namedtuple(  # type: ignore[misc]
 
 
 def meshed(fields: Marchable, meshes: Sequence[LevelMesh]) -> Any:
-    """Lay out a scene with the meshes of one row of levels, one a field, as a `Meshed`; one field costs no copy."""
+    """Lay out a scene with the meshes of one row of levels, one per field, as a `Meshed`; one field costs no copy."""
     trees = [mesh.tree for mesh in meshes if isinstance(mesh.tree, bvh.Tree)]
     memory = [tree.memory for tree in trees]
     scale = np.array([mesh.scale for mesh in meshes])
