@@ -7,7 +7,7 @@ imports and light, which write nothing, so every other moment is drawn from the 
 folder ``.NAME-...`` appears beside the result.
 
 Afterwards the result must be absent, the old one, or the new one, each complete: equal to that of an uninterrupted
-command, byte for byte (a run: light for light; what tells of seconds: readable). Only after SIGKILL may anything else
+command, byte for byte (a run: light for light; what records seconds: readable). Only after SIGKILL may anything else
 lie beside it, and the next command to the same place must work and remove it. Between the two renames of
 ``run --overwrite`` the folder is absent and both results are complete in the hidden folder, from which the next run
 puts the old one back; the summary counts this case. The exit code is 1 if anything else is found.

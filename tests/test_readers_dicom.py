@@ -219,7 +219,7 @@ def test_two_phases_are_a_choice(tmp_path, mark):
             whole.InstanceNumber += 10 * k
             whole.save_as(file)
     refused(tmp_path / "a", "2 time steps", "--time", *mark)
-    said = () if mark else ("nothing in its headers tells its 2 volumes",)
+    said = () if mark else ("its headers do not distinguish its 2 volumes",)
     for k in (0, 1):
         check(read(tmp_path / "a", *said, time=k), HOUNSFIELD + 200 * k)
 

@@ -57,7 +57,7 @@ class Bake:
         Paths from each target of a batch for every path of a walk: 1, or `texel_paths` for texels.
     bounces, seed : int
     answers : tuple of Samples
-        Moments of the light, one a batch; empty before the first walk.
+        Moments of the light, one per batch; empty before the first walk.
     walked : tuple of range
         Numbers of the paths walked, disjoint.
     """
@@ -281,8 +281,8 @@ def holes_within_range(scene: Scene, field: int, grid: IlluminationGrid) -> int:
 def _on_few_rows(scene: Scene, seed: int, rows: int = 4, count: int = 32) -> Queries:
     """About `count` queries on each of a few rows of the sweep, from the nodes of a coarse grid.
 
-    Few, because a backend of meshes builds one a row. The nodes of all fields, sorted by their place in the sweep, are
-    cut into equal parts; those nearest to the middle of a part move onto its row.
+    Few, because a backend of meshes builds one per row. The nodes of all fields, sorted by their place in the sweep,
+    are cut into equal parts; those nearest to the middle of a part move onto its row.
     """
     specs = [GridSpec.over(field.volume, 10) for field in scene.fields]
     nodes = join_queries([q for q in Direct().queries(scene, specs, seed) if len(q)])

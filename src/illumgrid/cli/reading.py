@@ -1,4 +1,4 @@
-"""Options that say what a volume file cannot say by itself, or which part of it is wanted."""
+"""Options that add what a volume file does not say, or choose a part of it."""
 
 from typing import Annotated, Any
 

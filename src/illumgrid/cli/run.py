@@ -200,7 +200,7 @@ def run(
     signed: Annotated[
         bool, typer.Option("--signed", help="Light h >= c and h <= -c, in two colours; --range is that of c, above 0.")
     ] = False,
-    backend: Annotated[str, typer.Option(help="Light transport: auto, numba, reference.")] = "auto",
+    backend: Annotated[str, typer.Option(help="Light transport: auto, numba, embree, reference.")] = "auto",
     paths: Annotated[
         int | None, typer.Option(min=1, metavar="N", help="Light paths from every query. [default: 32]")
     ] = None,

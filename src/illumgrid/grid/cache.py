@@ -22,7 +22,7 @@ ALIKE = 0.5
 
 
 class Cache(NamedTuple):
-    """Light at the nodes of lattices, one a field, then one a quad, laid out for kernels.
+    """Light at the nodes of lattices, one per field, then one per quad, laid out for kernels.
 
     A wall's lattice has the axes row of the sweep, v, u. A cell is named by its lowest node.
     """

@@ -82,7 +82,7 @@ class Corners:
 
 
 def corners(scene: Scene, specs: Sequence[GridSpec], points: Queries) -> Corners:
-    """The nodes around the points of queries in grids with these lattices, one a field."""
+    """The nodes around the points of queries in grids with these lattices, one per field."""
     row, weight = np.zeros((len(points), 8), np.int64), np.zeros((len(points), 8))
     parts, first, nodes = [], 0, 0
     for number, spec in enumerate(specs):

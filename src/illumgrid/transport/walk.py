@@ -76,7 +76,7 @@ class Walk:
     ranges : sequence of range
         Numbers of the paths from each target of a batch.
     answers : list of Samples
-        What is known already, one a batch, paths -1 where it is not; None for a batch without any.
+        What is known already, one per batch, paths -1 where it is not; None for a batch without any.
     """
 
     targets: Sequence[Queries]

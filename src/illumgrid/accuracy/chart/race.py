@@ -38,9 +38,9 @@ class Point:
     queries: int
     covered: NDArray[np.bool_]  # (n,) points that read only nodes with light of their own
     longest: int = 0  # nodes along the longest axis of all
-    seconds: list[float] = field(default_factory=list)  # one a seed: sampler, backend and interpolator
+    seconds: list[float] = field(default_factory=list)  # one per seed: sampler, backend and interpolator
     filling: float = 0.0  # of those of the first seed, what the interpolator took
-    light: list[Floats] = field(default_factory=list)  # one a seed, (n, 3): what the grids hold at the points
+    light: list[Floats] = field(default_factory=list)  # one per seed, (n, 3): what the grids hold at the points
     memory: float | None = None  # megabytes by which the process grew at most, in one run; known on Linux
     flip: float | None = None  # of a picture at an unseen isovalue
     default: bool = False  # whether it is what `run` does when nothing is asked for

@@ -120,7 +120,7 @@ def _chosen(frames: Sequence[Frame], wanted: Wanted, sources: dict[Path, Source]
     parts = phases(group)
     number = pick(wanted.time, "time", [name for name, _ in parts])
     if parts[number][0].startswith(REPEAT):
-        text = f"nothing in its headers tells its {len(parts)} volumes at the same places from each other"
+        text = f"its headers do not distinguish its {len(parts)} volumes at the same places"
         notes.append(("dicom", f"{text}; slices were counted by their numbers and the names of their files"))
     stack = arranged(parts[number][1])
     kind = stack.frames[0].kind
