@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from illumgrid.errors import shown_range
 from illumgrid.field.layers import layers_of
-from illumgrid.field.lights import Harmonics
 from illumgrid.field.scene import Field, Scene
 from illumgrid.field.upright import axes_of, up_of
 from illumgrid.field.volume import Floats, Lattice, box_corners, histogram
@@ -89,7 +88,7 @@ def kept_apart(light: Illumination) -> dict[str, float]:
 def _field(light: Illumination, number: int, stage: Stage, into: Bytes, notes: list[str]) -> dict[str, Any]:
     field, whole, sky = light.scene.fields[number], light.grids[number], skies.sky_of(light)
     room = skies.room(light) if sky else np.inf
-    most = min(MOST_NODES, int(min(1.0, room / skies.FEWEST) * whole.support.size))
+    most = min(MOST_NODES, int(min(1.0, room / (skies.FEWEST + skies.FINE)) * whole.support.size))
     volume, grid = reduced(field.volume, MOST_VOXELS), thinned(whole, most)
     sign = field.upward
     ends = sorted(sign * field.stored_range)
@@ -111,7 +110,7 @@ def _field(light: Illumination, number: int, stage: Stage, into: Bytes, notes: l
         lit = np.zeros(grid.spec.shape, bool)
         lit.flat[reachable(field, grid.spec)] = True
         held = skies.answers(light, sky, (grid.light.transpose(2, 1, 0, 3) * scale)[lit.T], grid.channels)
-        kept = _components(room * whole.support.size / grid.support.size, sky)
+        kept = skies.fitting(room * whole.support.size / grid.support.size, sky)
         shown["mask"] = into.add(np.packbits(lit.T.ravel(), bitorder="little").tobytes())
         shown["sky"], lost = skies.pack_sky(held, kept, into)
         _note_lost(notes, field.name, kept, len(sky.coefficients), lost)
@@ -142,10 +141,6 @@ def _note_reduced(
 def _mix(channels: Channels, light: NDArray[np.float32]) -> NDArray[np.float32]:
     """What is shown of light (..., C), clamped only after interpolation, as `IlluminationGrid.lookup` does."""
     return channels.shown(light) if channels.own else np.asarray(light @ np.array(channels.mix, np.float32))
-
-
-def _components(room: float, sky: Harmonics) -> int:
-    return int(np.clip(room, skies.FEWEST, len(sky.coefficients)))
 
 
 def _note_lost(notes: list[str], name: str, kept: int, of: int, lost: float) -> None:
@@ -199,7 +194,7 @@ def _walls(light: Illumination, stage: Stage, into: Bytes) -> tuple[list[dict[st
     if sky := skies.sky_of(light):
         side = _beside([wall.light for wall in light.walls]).transpose(2, 1, 0, 3) * scale
         held = skies.answers(light, sky, side, light.walls[0].channels)
-        atlas["sky"], _ = skies.pack_sky(held, _components(skies.room(light), sky), into)
+        atlas["sky"], _ = skies.pack_sky(held, skies.fitting(skies.room(light), sky), into)
     return described, atlas
 
 

@@ -22,8 +22,10 @@ from illumgrid.show.viewer.arrays import Bytes, half_planes
 MOST_BYTES = 18_000_000
 """Of the answers in one page, before compression: a grey field of 128³ voxels and a grid of 96³ nodes then stay under
 25 MB, whatever they hold."""
-FEWEST = 6
+FEWEST = 12
 """Components for which a grid is thinned if they do not fit."""
+FINE = 4
+"""The first components are half floats, the others, which are weaker, whole steps of 8 bits."""
 
 
 def sky_of(light: Illumination) -> Harmonics | None:
@@ -90,22 +92,22 @@ def components(light: NDArray[np.float32], most: int) -> tuple[NDArray[np.float3
 
 
 def pack_sky(held: Answers, most: int, into: Bytes) -> tuple[list[dict[str, Any]], float]:
-    """Planes of half floats and what each is, and what is lost.
+    """Planes of half floats, or of steps of 8 bits where they have a `scale`, and what each is, and what is lost.
 
     A plane has the colour that it adds to, -1 for all, and a `basis` (B,): its weight is the product with the
     coefficients of that colour, or 1 without a basis.
     """
     values, basis, lost = components(held.light, most)
-    colors = values.shape[1]
-    planes = [
-        {
-            "color": color if colors > 1 else -1,
-            "basis": row.tolist(),
-            "offset": into.add(half_planes(values[:, color, k])),
-        }
-        for k, row in enumerate(basis)
-        for color in range(colors)
-    ]
+    colors, planes = values.shape[1], []
+    for k, row in enumerate(basis):
+        for color in range(colors):
+            plane, about = values[:, color, k], {"color": color if colors > 1 else -1, "basis": row.tolist()}
+            if k < FINE:
+                about["offset"] = into.add(half_planes(plane))
+            else:
+                about["scale"] = float(np.abs(plane).max(initial=1e-30)) / 127
+                about["offset"] = into.add(np.round(plane / about["scale"]).astype(np.int8).tobytes())
+            planes.append(about)
     if held.rest.any():
         planes += [
             {"color": color, "basis": None, "offset": into.add(half_planes(held.rest[:, color]))} for color in range(3)
@@ -114,8 +116,13 @@ def pack_sky(held: Answers, most: int, into: Bytes) -> tuple[list[dict[str, Any]
 
 
 def room(light: Illumination) -> float:
-    """How many components of all nodes that are lit, and of all texels, fit a page."""
+    """Bytes that a page has for each value of a component: of each node that is lit, and texel, and colour."""
     lit = sum(len(reachable(field, grid.spec)) for field, grid in zip(light.scene.fields, light.grids))
     texels = sum(wall.light[..., 0].size for wall in light.walls)
     colors = 1 if any(name.endswith(".Y") for name in light.grids[0].channels.names) else 3
-    return MOST_BYTES / (2 * colors * max(lit + texels, 1))
+    return MOST_BYTES / (colors * max(lit + texels, 1))
+
+
+def fitting(bytes_: float, sky: Harmonics) -> int:
+    """How many components so many bytes for each value hold."""
+    return int(np.clip(bytes_ - FINE, FEWEST, len(sky.coefficients)))

@@ -72,9 +72,12 @@ export function mixedTexels(bytes, about, weights, sky) {
   };
   for (const { light, color, offset } of about.layers ?? []) color.forEach((share, k) => add(offset, k, share * weights[light]));
   about.lit ??= litTexels(bytes, about, count);
-  for (const { color, basis, offset } of sky ? about.sky : []) {
+  for (const { color, basis, offset, scale } of sky ? about.sky : []) {
     for (let k = 0; k < about.channels; k++) {
-      if (color < 0 || color === k) add(offset, k, basis ? basis.reduce((s, f, b) => s + f * sky[b][k], 0) : 1, about.lit);
+      const share = basis ? basis.reduce((s, f, b) => s + f * sky[b][k], 0) : 1, many = about.lit?.length ?? count;
+      if (color >= 0 && color !== k) continue;
+      if (!scale) add(offset, k, share, about.lit);
+      else for (let i = 0; i < many; i++) texels[each * (about.lit ? about.lit[i] : i) + k] += share * scale * ((bytes[offset + i] << 24) >> 24);
     }
   }
   for (let i = 0; i < texels.length; i++) texels[i] = Math.max(-65504, Math.min(65504, texels[i]));
