@@ -277,7 +277,7 @@ def test_the_judgement_agrees_with_a_reference_on_level_sets():
     assert 0 < found.uncertain < 0.2 * found.rmse
 
 
-def test_run_tells_what_it_chose_and_what_it_reached():
+def test_run_reports_what_it_chose_and_what_it_reached():
     scene = FIELDS["few bumps"]()
     recipe = run(scene, error=0.05, seed=0, judge=True).recipe
     assert recipe["plan"]["met"] and recipe["grid"] == recipe["plan"]["grid"]

@@ -83,7 +83,7 @@ def test_a_state_of_plain_arrays_goes_on_bit_by_bit(begun):
         same(after.walk(tracer, range(4, 8)), before.walk(tracer, range(4, 8)))
 
 
-def test_any_map_gives_the_same_and_tells_how_far_it_is(begun):
+def test_any_map_gives_the_same_and_says_how_far_it_is(begun):
     tracer, bake = begun
     reported = []
     with ThreadPoolExecutor(2) as pool:

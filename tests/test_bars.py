@@ -58,7 +58,7 @@ def test_holes_have_no_bar_and_harm_no_neighbour():
     assert np.isinf(grid(values, np.inf).bar).all()  # one path: nobody knows
 
 
-def test_two_nodes_tell_no_curve():
+def test_two_nodes_give_no_curve():
     assert grid(polynomial((2, 2, 2), (1, 1, 1))).bar.max() == 0
 
 

@@ -73,7 +73,7 @@ def parts_of(nodes, paths, noise, grid=0.0):
 PARTS = parts_of(8, 16, 0.05, 0.02), parts_of(8, 64, 0.01, 0.02), parts_of(16, 16, 0.04)
 
 
-def test_the_front_is_what_nobody_beats(truth):
+def test_the_front_is_what_nothing_dominates(truth):
     _, exact = truth
     points = [point(exact, s, e) for s, e in ((1, 0.1), (2, 0.05), (3, 0.07), (4, 0.02), (0.5, 0.3), (4.1, 0.02))]
     assert [p.seconds[0] for p in front(points, {"levelset": exact})] == [0.5, 1, 2, 4]
@@ -85,7 +85,7 @@ def test_the_errors_of_a_point_have_the_truths_variance_subtracted(truth):
     assert errors(exact.light, exact).rmse == pytest.approx(exact.error / 3)  # less cannot be distinguished from none
 
 
-def test_a_race_goes_from_cheap_to_dear_and_keeps_its_seeds(truth):
+def test_a_race_goes_from_cheap_to_expensive_and_keeps_its_seeds(truth):
     scene, exact = truth
     race = Race(scene, {"levelset": exact}, [METHOD, method(Uniform(8), method(Uniform(32)))], [4, 7], 3, 0)
     while contestant := race.next(np.inf):
@@ -126,7 +126,7 @@ def test_covered_points_read_only_nodes_with_light(truth):
     np.testing.assert_array_equal(covered([replace(grid, support=support)], asked), expected)
 
 
-def test_everything_that_is_registered_takes_part_or_is_told(truth):
+def test_everything_that_is_registered_takes_part_or_is_reported(truth):
     scene, exact = truth
     entrants, notes = tracers(scene, exact.queries, 1e6)
     ways = methods(entrants)
@@ -155,7 +155,7 @@ def test_the_advice_names_the_fastest_that_is_good_enough_and_what_is_missing(tr
     assert text.index("the front:") < text.index("direct") < text.index("the best of the others:")
 
 
-def test_remarks_tell_a_blunt_truth_and_missing_seeds(truth):
+def test_remarks_name_a_blunt_reference_and_missing_seeds(truth):
     _, exact = truth
     one, other = exact.halves
     answer = replace(other.samples, mean=other.samples.mean + 1)
@@ -236,7 +236,7 @@ def test_bench_refuses_before_anything_runs(refuse, tmp_path):
     refuse("bench", "v.npy", "-o", "mine", words=["mine", "new folder"])
 
 
-def test_run_tells_the_error_that_it_reached_and_what_it_chose(call, tmp_path):
+def test_run_reports_the_error_that_it_reached_and_what_it_chose(call, tmp_path):
     said = call("run", "v.npy", "--range", 0.3, 0.9, "--error", 0.1, "--no-preview", "-o", "e")
     assert "nodes along the longest axis" in said and "error reached" in said and "predicted" in said
     recipe = json.loads((tmp_path / "e" / "run.json").read_text("utf-8"))["recipe"]
@@ -286,7 +286,7 @@ def test_runs_default_is_charted_first_and_goes_on(truth):
     assert sum(p.paths == 64 for p in race.points) == 1 and {p.grid for p in race.points} == {5, 11}
 
 
-def test_it_is_told_where_runs_default_stands(truth):
+def test_it_reports_where_runs_default_stands(truth):
     _, exact = truth
     truths = {"levelset": exact}
     quick, own = point(exact, 1, 0.09, 8, 16), point(exact, 14.6, 0.2, 8, 64)

@@ -46,7 +46,7 @@ def test_what_ranks_below_a_level_is_below_it(scale):
         assert (values[below] < level).all()
 
 
-def test_of_few_values_the_ranks_tell_every_level_apart():
+def test_of_few_values_the_ranks_distinguish_every_level():
     values = np.random.default_rng(2).integers(0, 200, (20, 20, 20)).astype(np.float32)
     steps = lay_bricks(values).steps
     for level in [*np.arange(1.0, 200.0), 0.5, 17.01, 17.99]:

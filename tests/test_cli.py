@@ -69,7 +69,7 @@ def test_ranges_may_be_negative_and_the_solid_below(call, tmp_path):
     assert len(np.unique(shown(tmp_path / "lobe.png"))) > 3
 
 
-def test_material_smoothing_seed_and_depth_are_as_told(call, tmp_path):
+def test_material_smoothing_seed_and_depth_are_as_given(call, tmp_path):
     options = "--grid 6 --paths 3 --bounces 2 --seed 9 --albedo 0.1 0.2 0.3 --smooth 1.5 --no-preview -o out"
     call("run", "v.npy", *RANGE, *options.split())
     made, light = recipe(tmp_path / "out"), ig.load(tmp_path / "out")
@@ -207,7 +207,7 @@ def test_pictures_that_cannot_be_drawn_are_refused(call, refuse, tmp_path):
     refuse("preview", "out", "--isovalue", "nan", "-o", "x.png", words=["nan"])
 
 
-def test_info_tells_of_a_volume_what_is_worth_knowing(call, tmp_path):
+def test_info_describes_a_volume(call, tmp_path):
     np.savez(tmp_path / "w.npz", values=ball(10).values, origin=(1, 2, 3), spacing=(0.5, 1, 2), direction=MIRRORED)
     said = call("info", "w.npz")
     low, high, why = ig.suggest_range(ig.read_volume(tmp_path / "w.npz"))
@@ -237,7 +237,7 @@ def test_a_run_says_once_which_backend_auto_took_and_why(call):
     assert "backend:" not in named
 
 
-def test_info_tells_of_a_run_what_is_inside(call):
+def test_info_describes_a_run(call):
     call("run", "v.npy", *RANGE, *QUICK, "--seed", "4", "--no-preview", "-o", "out")
     said = call("info", "out")
     made = ("sampler direct", "backend numba", "interpolator nearest", "2 paths", "1 bounces", "seed 4")
@@ -248,7 +248,7 @@ def test_info_tells_of_a_run_what_is_inside(call):
 # The rest
 
 
-def test_the_version_and_the_help_are_told(call):
+def test_the_version_and_the_help_are_reported(call):
     assert call("--version").strip() == f"illumgrid {ig.__version__}"
     said = call("run", "--help")
     stages = "--sampler --isovalues --range --inside --backend --paths --bounces --seed --grid --interpolator"

@@ -95,7 +95,9 @@ def test_a_kill_at_any_moment_leaves_a_whole_run_or_none(folder):
 
 
 @pytest.mark.parametrize("overwrite", [(), ("--overwrite",)])
-def test_of_two_runs_into_one_folder_one_wins_and_the_other_is_told(folder, overwrite, tmp_path_factory, monkeypatch):
+def test_of_two_runs_into_one_folder_one_wins_and_the_other_is_refused(
+    folder, overwrite, tmp_path_factory, monkeypatch
+):
     monkeypatch.setenv("TMPDIR", str(tmp_path_factory.mktemp("kept")))  # where the loser keeps its light
     args = ("run", "v.npy", "--range", "0.3", "0.9", "--grid", "6", "--paths", "2", "--no-preview", "-o", "out")
     both = [start(*args, "--seed", str(seed), *overwrite, cwd=folder, said=subprocess.PIPE) for seed in (0, 1)]

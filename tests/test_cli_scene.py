@@ -56,7 +56,7 @@ def test_a_volume_gets_the_surroundings_asked_for(call, tmp_path, name):
     assert np.array_equal(made.background, expected.background) and "v: 10 x 10 x 10" in said
 
 
-def test_a_scene_file_is_lit_and_told_of(call, tmp_path, corner):
+def test_a_scene_file_is_lit_and_described(call, tmp_path, corner):
     said = call("run", "in/corner.toml", *QUICK, "--bounces", "1")
     assert "near: 10 x 10 x 10" in said and "far: 8 x 8 x 8" in said and "wrote corner-light" in said
     light = ig.load(tmp_path / "corner-light")
@@ -93,7 +93,7 @@ def test_a_scene_file_that_is_wrong_is_refused(refuse, corner):
     refuse("run", "in/corner.toml", words=["corner.toml: [[quad]] 1 'lamp'", "edges"])
 
 
-def test_bounces_follow_the_scene_and_what_they_leave_out_is_told(call, tmp_path):
+def test_bounces_follow_the_scene_and_what_they_leave_out_is_reported(call, tmp_path):
     options = ("run", "v.npy", "--range", "0.3", "0.9", "--albedo", "0.3", "0.3", "0.3", *QUICK)
     assert "bounces beyond 4 would add" in call(*options, "-o", "open")
     said = call(*options, "--scene", "box", "-o", "closed")

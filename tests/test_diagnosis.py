@@ -78,7 +78,7 @@ def test_flat_spots_of_integers_are_no_plateaus():
     assert plateaus(Volume(values)) == []
 
 
-def test_noise_is_told_with_what_a_blur_would_bring():
+def test_noise_is_reported_with_what_a_blur_would_bring():
     found = findings(hills(noise=0.1), (0.3, 1.5))
     assert "noise" in found and "--smooth 1" in found["noise"]
     assert "on a grid of 48 nodes" in found["noise"]
@@ -107,7 +107,7 @@ def test_turning_does_not_depend_on_the_slabs(monkeypatch):
     assert turning(long, 0.2, 0.8) == pytest.approx(turning(turned, 0.2, 0.8), rel=1e-5)
 
 
-def test_thin_parts_are_told_with_the_grid_that_would_do():
+def test_thin_parts_are_reported_with_the_grid_that_would_do():
     slab = sampled(lambda x: 1 - np.abs(x[:, 2]) / 0.06, (40, 40, 40), origin=(-1,) * 3, spacing=np.full(3, 2 / 39))
     padded = slab.with_values(np.where(np.abs(np.indices(slab.shape) - 19.5).max(axis=0) > 17, -16, slab.values))
     assert "resample" in findings(padded, (0.2, 0.6), grid=48)["thin"]
@@ -116,7 +116,7 @@ def test_thin_parts_are_told_with_the_grid_that_would_do():
     assert "thin" not in findings(ball(40), (0.3, 0.9))
 
 
-def test_the_border_is_told_with_its_planes():
+def test_the_border_is_reported_with_its_planes():
     found = findings(ball(20, at=(0.6, 0, 0)), (0.3, 0.9))["border"]
     assert "the last x plane" in found and "first" not in found
     below = ball(20, at=(0.6, 0, 0))
@@ -124,13 +124,13 @@ def test_the_border_is_told_with_its_planes():
     assert "the last x plane" in found and "first" not in found
 
 
-def test_isovalues_without_a_surface_are_told():
+def test_isovalues_without_a_surface_are_reported():
     assert "1.19" in findings(ball(20), (0.3, 1.19))["empty"]
     found = findings(ball(20), (0.3, 2.0))
     assert "range" in found and "empty" in found and "2" in found["range"]
 
 
-def test_long_voxels_are_told_with_their_axes():
+def test_long_voxels_are_reported_with_their_axes():
     found = findings(ball(20, origin=(-1,) * 3, spacing=(0.1, 0.1, 0.4)), (0.3, 0.9))
     assert "4 times longer along z than along x" in found["anisotropy"]
 
@@ -175,7 +175,7 @@ def test_critical_isovalues_are_found_where_they_are():
 LIMITS = ("--range", "0.3", "0.9", "--grid", "8", "--paths", "2", "--bounces", "1", "--isovalues", "2", "--no-preview")
 
 
-def test_a_run_tells_and_records_and_can_be_told_not_to(call, tmp_path):
+def test_a_run_reports_and_records_and_can_be_silent(call, tmp_path):
     np.save(tmp_path / "off.npy", ball(12, at=(0.6, 0, 0)).values)
     assert "note: border: at 0.3 " in call("run", "off.npy", *LIMITS, "-o", "a")
     assert json.loads((tmp_path / "a" / "run.json").read_text("utf-8"))["recipe"]["warnings"][0].startswith("border: ")

@@ -175,7 +175,7 @@ def test_certainty_is_that_of_the_nodes_that_a_lookup_mixes():
     assert np.array_equal(outside[0], [grid.error[0, 0, 0], grid.error[-1, -1, -1]])
 
 
-def test_many_points_are_looked_up_in_parts_and_progress_is_told(tmp_path, monkeypatch):
+def test_many_points_are_looked_up_in_parts_and_progress_is_reported(tmp_path, monkeypatch):
     light = lopsided_light(DIRECTIONS["oblique"])
     exports.write(light, tmp_path / "a.npz", on="field")
     monkeypatch.setattr(exports.arrays, "_AT_ONCE", 50)

@@ -19,7 +19,7 @@ def run(tmp_path):
 
 
 @pytest.mark.parametrize("ending", ENDINGS)
-def test_every_kind_is_written_and_told(call, run, tmp_path, ending):
+def test_every_kind_is_written_and_reported(call, run, tmp_path, ending):
     (tmp_path / f"x.{ending}").write_text("an older file is replaced, as preview does")
     said = call("export", "run", f"x.{ending}")
     assert said.startswith(f"wrote x.{ending}: ") and said.count("\n") == 1

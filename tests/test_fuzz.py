@@ -26,7 +26,7 @@ def test_a_moment_of_fuzzing(target):
 
 
 @forks
-def test_the_harness_hears_a_crash_a_hang_and_an_exception(monkeypatch, tmp_path):
+def test_the_harness_detects_a_crash_a_hang_and_an_exception(monkeypatch, tmp_path):
     import os
     import time
 

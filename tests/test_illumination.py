@@ -62,7 +62,7 @@ def test_the_recipe_says_how_it_was_made(light):
     assert json.loads(json.dumps(recipe, allow_nan=False)) == recipe
 
 
-def test_the_error_told_is_that_of_the_nodes():
+def test_the_reported_error_is_that_of_the_nodes():
     rough = ig.Volume(np.random.default_rng(0).random((6, 6, 6)))
     light = ig.run(ig.Scene.sky(rough, range=(0.3, 0.7)), paths=16, bounces=1)
     known = light.grids[0].support > 0
@@ -89,7 +89,7 @@ def test_what_is_saved_is_what_is_loaded(light, tmp_path):
     assert np.array_equal(again.color(points), light.color(points))
 
 
-def test_saving_draws_the_picture_unless_told_not_to_and_replaces_only_when_told_to(light, tmp_path, monkeypatch):
+def test_saving_draws_the_picture_unless_it_must_not_and_replaces_only_when_it_may(light, tmp_path, monkeypatch):
     monkeypatch.setattr(preview.render, "__kwdefaults__", {**preview.render.__kwdefaults__, "width": 80, "height": 60})
     light.save(tmp_path / "out")
     with Image.open(tmp_path / "out" / "preview.png") as picture:
@@ -186,7 +186,7 @@ def test_holes_within_the_range_are_a_warning_that_counts_them():
     assert np.isfinite(light.grids[0].values).all() and light.recipe["holes"][0] > 10
 
 
-def test_progress_tells_what_is_done_of_how_much():
+def test_progress_says_what_is_done_of_how_much():
     calls = []
     ig.run(sky(ball(8)), **QUICK, progress=lambda *what: calls.append(what))
     assert calls[0][:2] == ("light", 0) and calls[-1] == ("grid", 1, 1)

@@ -93,7 +93,7 @@ def test_meshes_and_what_is_no_light_are_not_judged(backend):
     assert ig.run(sky(ball(9)), **stages, **QUICK).recipe["reached"] is None
 
 
-def test_a_library_user_hears_the_error_too():
+def test_a_library_user_gets_the_error_too():
     made = ig.run(sky(ball(9)), **QUICK).recipe
     assert 0 < made["reached"] < 0.1 and 0 < made["reached_uncertain"] < made["reached"]
     assert ig.run(sky(ball(9)), **{**QUICK, "judge": False}).recipe["reached"] is None
@@ -134,3 +134,10 @@ def test_nodes_and_texels_are_counted_apart_with_their_paths_and_only_light_is_t
     assert "texels" not in call(
         "run", "v.npy", "--range", 0.3, 0.9, "--grid", 4, "--paths", 1, "--no-preview", "-o", "p"
     )
+
+
+def test_a_run_sets_its_scene_up_once(monkeypatch):
+    set_up, prepare = [], chain.prepare
+    monkeypatch.setattr(chain, "prepare", lambda backend, scene: set_up.append(backend) or prepare(backend, scene))
+    assert ig.run(sky(ball(9)), **{**QUICK, "judge": True}).recipe["reached"] is not None
+    assert len(set_up) == 1

@@ -284,7 +284,7 @@ def test_lights_of_a_scene_file(scene_file, tmp_path):
         ('[[light]]\nname = "a"\ndirection = [0, 0, 1]\nangle = 95\nirradiance = [1, 1, 1]', "angle of light 'a'"),
     ],
 )
-def test_bad_lights_of_a_scene_file_are_told(scene_file, table, words):
+def test_bad_lights_of_a_scene_file_are_reported(scene_file, table, words):
     with pytest.raises(BadInput, match=words):
         ig.read_scene(scene_file(table + "\n"))
 

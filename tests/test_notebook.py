@@ -54,12 +54,12 @@ def shown(browser, view):  # noqa: F811
     page.on("pageerror", lambda error: troubles.append(str(error)))
     page.set_content("<div id=here style='width: 160px'></div>")
     lead = """async ([script, traits, data]) => {
-        const bytes = Uint8Array.from(atob(data), (c) => c.charCodeAt(0)), heard = {};
+        const bytes = Uint8Array.from(atob(data), (c) => c.charCodeAt(0)), handlers = {};
         traits._data = new DataView(bytes.buffer);
         globalThis.model = { get: (k) => traits[k], set: (k, v) => { traits[k] = v },
             save_changes: () => { model.saved = traits.isovalue },
-            on: (k, f) => { heard[k] = f }, off: () => {},
-            lead: (v, k = 'isovalue') => { traits[k] = v; heard[`change:${k}`]() } };
+            on: (k, f) => { handlers[k] = f }, off: () => {},
+            lead: (v, k = 'isovalue') => { traits[k] = v; handlers[`change:${k}`]() } };
         const module = await import(URL.createObjectURL(new Blob([script], { type: 'text/javascript' })));
         await module.default.render({ model, el: document.getElementById('here') });
     }"""

@@ -150,7 +150,7 @@ def test_the_stage_leads_to_the_indices_that_the_world_does():
     assert np.abs(place[:, :3]).max() <= 0.51
 
 
-def test_what_is_too_large_is_reduced_and_told(monkeypatch):
+def test_what_is_too_large_is_reduced_and_reported(monkeypatch):
     volume = sampled(lambda x: x @ (1.0, 2.0, 3.0), (30, 30, 30), (5, 6, 7), (1, 2, 1), MIRRORED)
     small = reduced(volume, most=20**3)
     assert small.shape == (15, 15, 15) and reduced(volume, most=30**3) is volume

@@ -102,7 +102,7 @@ def test_walls_and_caps_have_no_color_that_could_be_taken_for_a_bar():
 # Words
 
 
-def test_what_bars_cannot_tell_is_said_with_the_field():
+def test_what_bars_do_not_show_is_said_with_the_field():
     light = barred(0.05, nodes=12)
     assert doubts(light) == []
     light = barred(0.05, nodes=12)

@@ -112,7 +112,7 @@ def test_missing_data_file(tmp_path, ending):
     refused(tmp_path / f"a.{ending}")
 
 
-def test_memory_error_is_told(tmp_path, monkeypatch):
+def test_memory_error_is_reported(tmp_path, monkeypatch):
     np.save(tmp_path / "a.npy", values())
     monkeypatch.setattr(limits, "free_memory", lambda: 100)
     refused(tmp_path / "a.npy", "memory")

@@ -102,7 +102,7 @@ def test_sheared_axes_are_resampled_onto_right_angles():
     assert np.allclose(volume.values[tuple(index.T)], there, rtol=1e-6)
 
 
-def test_a_sixth_of_a_degree_is_rounded_away_and_told():
+def test_a_sixth_of_a_degree_is_rounded_away_and_reported():
     skewed = np.array([[1, 0.0026, 0], [0, 1, 0], [0, 0, 1]])
     volume, notes = place(Stored(values(), np.zeros(3), skewed))
     assert np.array_equal(volume.values, values()) and "0.15° off right angles" in notes[0][1]

@@ -131,14 +131,14 @@ def test_header_size_and_byte_skip(tmp_path):
             assert np.array_equal(read_volume(tmp_path / name).values, values())
 
 
-def test_data_after_the_end_are_told(tmp_path):
+def test_data_after_the_end_are_reported(tmp_path):
     (tmp_path / "a.mha").write_bytes(meta_head("LOCAL") + values().T.tobytes() + b"more")
     with pytest.warns(IllumgridWarning, match="file: a.mha: 4 bytes follow its data"):
         assert np.array_equal(read_volume(tmp_path / "a.mha").values, values())
 
 
 @pytest.mark.parametrize("encoding", ["text", "hex", "meta"])
-def test_numbers_after_the_end_of_a_text_are_told(tmp_path, encoding):
+def test_numbers_after_the_end_of_a_text_are_reported(tmp_path, encoding):
     numbers = values().ravel(order="F")
     text = numbers.tobytes().hex() if encoding == "hex" else " ".join(map(str, numbers))
     meta = encoding == "meta"
@@ -163,7 +163,7 @@ def test_a_meta_image_with_a_checksum_that_is_wrong(tmp_path):
     refused(tmp_path / "a.mha", "incorrect data check")
 
 
-def test_no_spacing_is_told(tmp_path):
+def test_no_spacing_is_reported(tmp_path):
     (tmp_path / "a.mha").write_bytes(
         meta_head("LOCAL").replace(b"ElementSpacing = 1 1 1\n", b"") + values().T.tobytes()
     )

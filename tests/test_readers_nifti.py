@@ -44,7 +44,7 @@ def test_both_versions_and_pairs(tmp_path, name, kind):
         refused(file, "a.img, is not there", "copy both")
 
 
-def test_the_sform_counts_and_a_difference_is_told(tmp_path):
+def test_the_sform_counts_and_a_difference_is_reported(tmp_path):
     other = AFFINE.copy()
     other[0, 3] += 3
     file = saved(tmp_path / "a.nii", qform=(AFFINE, 1), sform=(other, 2))
@@ -59,7 +59,7 @@ def test_one_of_both(tmp_path, which):
     lies_as_nibabel_says(file, read_volume(file))
 
 
-def test_neither_is_told(tmp_path):
+def test_neither_is_reported(tmp_path):
     file = saved(tmp_path / "a.nii", qform=(None, 0), sform=(None, 0))
     with pytest.warns(IllumgridWarning, match="placement: .*sets neither qform nor sform"):
         lies_as_nibabel_says(file, read_volume(file))
@@ -135,7 +135,7 @@ def test_freesurfer(tmp_path, ending):
     refused(tmp_path / f"a.{ending}", "holds 2 time steps")
 
 
-def test_what_nibabel_mends_is_told_and_stays_off_the_terminal(tmp_path, capfd):
+def test_what_nibabel_mends_is_reported_and_stays_off_the_terminal(tmp_path, capfd):
     file = saved(tmp_path / "a.nii", sform=(AFFINE, 1), qform=(None, 0))
     data = bytearray(file.read_bytes())
     data[80:84] = np.array(-1.2, "<f4").tobytes()  # pixdim[1]

@@ -252,7 +252,7 @@ def test_a_name_that_two_packages_claim_is_an_error_for_its_users_and_a_warning_
     assert "3.4 (two)" in text
 
 
-def test_nobody_takes_a_name_of_the_packages_own(install):
+def test_no_plugin_takes_a_name_of_the_packages_own(install):
     install("greedy", SAMPLER.replace("NAME", "direct"))
     assert "greedy 1.0" in messages()[0]
     refused(lambda: ig.sampler("direct"), "illumgrid", "greedy", f"{registry.SWITCH}=greedy")
@@ -288,7 +288,7 @@ def test_what_a_strangers_stage_refuses_is_bad_input(install):
     refused(lambda: ig.sampler("mine", at="1,2"), "'mine'", "too far")
 
 
-def test_a_run_beside_a_broken_plugin_tells_of_it_and_ends_well(install, call, tmp_path):
+def test_a_run_beside_a_broken_plugin_reports_it_and_ends_well(install, call, tmp_path):
     install("rotten", "raise OSError('mould')")
     quick = ("run", "v.npy", "--range", "0.3", "0.9", "--grid", "5", "--paths", "1", "--bounces", "0", "--no-preview")
     assert "the plugin rotten 1.0 (rotten) cannot be used in full" in call(*quick, "-o", "out")

@@ -85,6 +85,12 @@ def test_ctrl_c_ends_the_building_of_a_tree(monkeypatch):
     assert ended == [[1, 1, 1]]
 
 
+def test_tracers_of_a_process_share_their_threads(box):
+    scene, _ = box
+    one, other, fewer = (prepare(Numba(threads=n), scene).threads for n in (2, 2, 1))
+    assert one is other and one is not fewer
+
+
 def test_a_batch_shows_progress_within_it(box):
     scene, queries = box
     shown = []

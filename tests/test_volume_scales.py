@@ -118,7 +118,7 @@ def test_a_map_that_is_given():
         ig.Volume(np.zeros((2, 2, 2)), slope=0, intercept=1)
 
 
-def test_numbers_are_told_apart():
+def test_numbers_are_distinguished():
     assert shown_range((101320, 101330)) == "101320 to 101330"
     assert shown_range((1e6 - 0.2, 1e6 + 0.2)) == "999999.8 to 1000000.2"
     assert shown_range((0.123456, 0.9)) == "0.1235 to 0.9" and shown(0.0) == "0"

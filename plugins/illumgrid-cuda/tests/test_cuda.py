@@ -56,8 +56,8 @@ print("the same")
 
 def test_a_simulated_card_gives_the_answers_of_numba_node_by_node():
     path = os.pathsep.join(p for p in sys.path if p)
-    told = {**os.environ, "PYTHONPATH": path, "NUMBA_ENABLE_CUDASIM": "1"}
-    done = subprocess.run([sys.executable, "-c", SIMULATED], env=told, capture_output=True, text=True)
+    environment = {**os.environ, "PYTHONPATH": path, "NUMBA_ENABLE_CUDASIM": "1"}
+    done = subprocess.run([sys.executable, "-c", SIMULATED], env=environment, capture_output=True, text=True)
     assert done.stdout.strip().endswith("the same"), done.stdout + done.stderr
 
 
