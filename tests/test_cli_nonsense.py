@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import typer
 
-from illumgrid import cli, registry
+from illumgrid import chain, cli, registry
 from illumgrid import show as preview
 from illumgrid.registry.options import options
 from shapes import ball
@@ -24,6 +24,7 @@ BASE = {
     "export": "out x.npz",
     "info": "v.npy",
     "bench": "v.npy --budget nan -o new",  # what is legal otherwise is refused for that, before minutes go by
+    "density": "points.csv --spacing 1 --sigma 1 -o x.nrrd",
     "verify": "--backend nonsense",
     "plugins": "",
 }
@@ -51,6 +52,7 @@ READING = {
     "--label": [*WORDS, "7"],
     "--crop": [*(f"{n}|8|0|8|0|8" for n in (*WORDS, "-1", "7", HUGE)), "0|1|0|8|0|8", "5|2|0|8|0|8"],
     "--downsample": [*WORDS, "-1", "0", HUGE],
+    "--follow": FLAG,
 }
 LIGHT = {
     "--light": [*NAMES, "sky=", "sky=two", "sky=nan", "=1", "nonsense=1"],
@@ -79,7 +81,7 @@ REFUSED = {
     ("run", "--grid"): [*WORDS, "-1", "0", "1", HUGE],
     ("run", "--scene"): NAMES,
     ("run", "--albedo"): [f"{n}|0.5|0.5" for n in (*NUMBERS, "-1", "1.5", HUGE)],
-    **{(command, option): values for command in ("run", "info") for option, values in READING.items()},
+    **{(command, option): values for command in ("run", "info", "bench") for option, values in READING.items()},
     **{(command, option): values for command in ("preview", "view", "export") for option, values in LIGHT.items()},
     ("run", "--lights"): NAMES,
     ("run", "--degree"): [*WORDS, "-1", "2", HUGE],
@@ -93,6 +95,11 @@ REFUSED = {
     ("run", "--no-preview"): FLAG,
     ("run", "--overwrite"): FLAG,
     ("run", "--ignore"): NAMES,
+    ("run", "--no-embed"): FLAG,
+    ("run", "--resume"): FLAG,
+    ("run", "--any-machine"): FLAG,
+    ("run", "--workers"): [*WORDS, "-1", "0"],
+    ("run", "--dask"): ["", "nonsense", "☃"],
     ("preview", "folder"): RUNS,
     ("preview", "--output"): targets(".png"),
     ("preview", "--sweep"): [
@@ -117,6 +124,8 @@ REFUSED = {
     ("preview", "--roll"): NUMBERS,
     ("preview", "--camera"): ["missing", "folder", "v.npy", "text.txt", "", "x" * 300],
     ("preview", "--scale-bar"): FLAG,
+    ("preview", "--exact"): [*NAMES, "0", "1.5", "full:", "full:0", "full:two"],
+    ("preview", "--watch"): [*FLAG, ""],
     ("view", "--up"): [*NAMES, "w"],
     ("view", "folder"): RUNS,
     ("view", "--export"): targets(".html"),
@@ -128,6 +137,7 @@ REFUSED = {
     ("export", "--isovalue"): [*NUMBERS, "0.5"],
     ("export", "--on"): NAMES,
     ("export", "--array"): NAMES,
+    ("export", "--onto"): ["missing", "folder", "v.npy", "text.txt", "", "x" * 300],
     ("info", "source"): [*SOURCES, "half"],
     ("info", "--range"): [*(f"{n}|1" for n in NUMBERS), *(f"0.3|{n}" for n in NUMBERS), "0.9|0.3", "0.5|0.5"],
     ("info", "--inside"): NAMES,
@@ -138,6 +148,18 @@ REFUSED = {
     ("bench", "--output"): ["v.npy", "v.npy/x", "sealed/new", "x" * 300, "", ".", "/", "folder", "dangling", "out"],
     ("bench", "--smooth"): [*NUMBERS, "-1", "1e308", HUGE],
     ("bench", "--seed"): [*WORDS, "-1", HUGE],
+    ("density", "points"): [*SOURCES, "v.npy"],
+    ("density", "--output"): targets(".nrrd"),
+    ("density", "--spacing"): [*NUMBERS, "-1", "0"],
+    ("density", "--sigma"): [*NUMBERS, "-1"],
+    ("density", "--weights"): ["nonsense", "", "☃", "x" * 300, "7"],
+    ("density", "--columns"): ["a|b|c", "x|y|7", "||"],
+    ("density", "--cell"): ["nonsense", "", "1,2", "0,1,1", "-1,1,1", "nan,1,1", "1,1,1,1", "file"],
+    ("plugins", "--new"): [
+        *(f"{name}|sampler|new" for name in ("", "-1", "a/b", "☃")),
+        *(f"fine|{kind}|new" for kind in NAMES),
+        *(f"fine|sampler|{place}" for place in ("v.npy", "v.npy/x", "sealed/new")),
+    ],
     ("verify", "--backend"): NAMES,
     ("verify", "--paths"): [*WORDS, "-1", "0", HUGE],
     ("verify", "--seed"): [*WORDS, "-1", HUGE],
@@ -180,10 +202,11 @@ def finished(tmp_path_factory):
         assert cli.guarded(lambda: cli.app(["run", *args], standalone_mode=False)) == 0
     finally:
         os.chdir(here)
-    for name in ("folder", "folder.png", "folder.html", "folder.npz", "folder.gif", "sealed", "half"):
+    for name in ("folder", "folder.png", "folder.html", "folder.npz", "folder.nrrd", "folder.gif", "sealed", "half"):
         (place / name).mkdir()
     (place / "folder" / "letter").write_text("dear")
     (place / "text.txt").write_text("no volume")
+    (place / "points.csv").write_text("x,y,z\n0,0,0\n1,2,3\n")
     (place / "dangling").symlink_to("nowhere")
     shutil.copy(place / "out" / "run.json", place / "half")
     return place
@@ -194,6 +217,7 @@ def outcome(finished, capsys, monkeypatch):
     """Exit code, output and new files of a command; the new files are removed again."""
     small = {**preview.render.__kwdefaults__, "width": 24, "height": 18}
     monkeypatch.setattr(preview.render, "__kwdefaults__", small)
+    monkeypatch.setattr(chain, "judged", lambda light, *about: light)
     monkeypatch.chdir(finished)
 
     def outcome(args):
