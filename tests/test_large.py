@@ -1,0 +1,90 @@
+"""Large fields are looked at in slabs, cubes and columns: here small ones are, and nothing or little changes."""
+
+import numpy as np
+import pytest
+
+from illumgrid.accuracy import points
+from illumgrid.accuracy.points import unseen_in_volume
+from illumgrid.field import boundaries, bricks, diagnosis
+from illumgrid.field.boundaries import suggest_range
+from illumgrid.field.bricks import lay_bricks
+from illumgrid.field.coarse import block_means
+from illumgrid.field.diagnosis import diagnose, plateaus, turning
+from illumgrid.field.lattice import nodes_over
+from illumgrid.field.scene import Field
+from illumgrid.field.volume import Volume, histogram, interpolate, slabs, world_to_index
+from illumgrid.grid.nodes import reachable
+from illumgrid.show.camera import outline_of
+from illumgrid.show.viewer.arrays import field_steps
+from shapes import ball, sky
+
+
+def lumps(kind=np.float32, shape=(23, 14, 19)):
+    """A field with plateaus that go through many slabs, and gaps in none."""
+    x, y, z = np.meshgrid(*(np.linspace(-4, 4, n) for n in shape), indexing="ij")
+    return Volume((100 + 60 * np.sin(x) * np.cos(y + z)).clip(80, 120).astype(kind))
+
+
+def everything(volume):
+    field = Field("f", volume, range=(79, 118))
+    flat = [(value, share, place.tolist()) for value, share, place in plateaus(volume)]
+    laid = lay_bricks(volume.values, -1.0)
+    steps, *about = field_steps(volume, (85.0, 115.0))
+    outline = outline_of(sky(volume, (85, 115)), np.array([105.0]))
+    found = [
+        flat, [one.sentence for one in diagnose(field, nodes_over(volume))], suggest_range(volume),
+        histogram(volume, 30)[0].tolist(), laid.records.tolist(), steps.tolist(), about,
+        block_means(volume, (2, 3, 4)).values.tolist(), reachable(field, nodes_over(volume, 9)).tolist(),
+        sorted(map(tuple, outline.tolist())), volume.gaps, volume.extremes,
+    ]  # fmt: skip
+    assert len(flat) == 2 and found[1]
+    return found
+
+
+@pytest.mark.parametrize("kind", ["uint8", "float32"])
+def test_slabs_change_nothing(monkeypatch, kind):
+    whole = everything(lumps(kind))
+    monkeypatch.setattr(slabs, "__defaults__", (14 * 19 * 2,))
+    monkeypatch.setattr(bricks, "AT_ONCE", 1)
+    parts = everything(lumps(kind))
+    for one, other in zip(whole, parts):
+        assert one == other
+
+
+def test_slabs_are_the_array_in_order():
+    found = list(slabs((10, 3, 4), 30))
+    assert [(s.start, s.stop) for s in found] == [(0, 2), (2, 4), (4, 6), (6, 8), (8, 10)]
+    assert [(s.start, s.stop) for s in slabs((3, 100, 100), 1)] == [(0, 1), (1, 2), (2, 3)]
+
+
+def test_all_cubes_together_turn_as_the_whole(monkeypatch):
+    volume = lumps()
+    whole = [turning(volume, 85, 115, blur) for blur in (0.0, 1.0)]
+    monkeypatch.setattr(diagnosis, "_LOOKED_AT", 0)
+    monkeypatch.setattr(diagnosis, "_BLOCK", 6)
+    parts = [turning(volume, 85, 115, blur) for blur in (0.0, 1.0)]
+    np.testing.assert_allclose(parts, whole, rtol=1e-6)
+    monkeypatch.setattr(diagnosis, "_ENOUGH", 1)
+    assert turning(volume, 85, 115) == pytest.approx(whole[0], rel=0.3)
+
+
+@pytest.mark.parametrize("inside", ["above", "below"])
+def test_cubes_suggest_nearly_the_range_of_the_whole(monkeypatch, inside):
+    volume = Volume(np.round(100 / (1 + np.exp(-20 * (ball(40).values - 0.5)))).astype(np.uint8))
+    whole = suggest_range(volume, inside)[:2]
+    monkeypatch.setattr(boundaries, "_SLABBED", 0)
+    monkeypatch.setattr(boundaries, "_CUBE", 6)
+    np.testing.assert_allclose(suggest_range(volume, inside)[:2], whole, atol=10)
+
+
+def test_points_in_some_columns_are_even_over_the_range(monkeypatch):
+    scene = sky(ball(30))
+    monkeypatch.setattr(points, "_LOOKED_AT", 6000)  # of 27000 voxels
+    asked = unseen_in_volume(scene, 2000, seed=0)
+    volume = scene.fields[0].volume
+    place = scene.fields[0].place(interpolate(volume, world_to_index(volume, asked.point)))
+    counts, _ = np.histogram(place, 8, (0, 1))
+    assert len(asked) > 1500 and counts.sum() == len(asked)
+    np.testing.assert_allclose(counts / counts.mean(), 1, atol=0.1)
+    away = np.linalg.norm(asked.point, axis=1)  # level c is the sphere of radius 1.2 - c
+    np.testing.assert_allclose(1.2 - away, asked.level[:, 0], atol=0.01)
