@@ -16,7 +16,7 @@ from illumgrid.field.volume import AT_ONCE, slabs
 RANKS = 255
 """Steps from the lowest rank to the highest."""
 
-LARGE = 1 << 28
+LARGE = 1 << 27
 """Voxels from which on a brick has twice as many cells along each side: its records then take an eighth of the memory,
 a quarter of a byte for each voxel."""
 
