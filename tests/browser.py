@@ -143,8 +143,12 @@ class Browser:
         self.page.on("pageerror", lambda error: self.troubles.append(str(error)))
         self.page.on("console", lambda said: self.troubles.append(said.text) if said.type == "error" else None)
 
-    def open(self, light, address="", anew=False):
-        """Show a light at an address; a page that shows this light already only gets the address."""
+    def open(self, light, address="", anew=False, rest=False):
+        """Show a light at an address; a page that shows this light already only gets the address. Pictures of lookups
+        are compared while no rays refine them.
+        """
+        if not rest:
+            address = f"{address}&rest=0" if address else "rest=0"
         if self.shown is light and not anew:
             self.page.evaluate(TO, address)
             return self.settle()

@@ -30,13 +30,13 @@ LIGHT = coloured(pair())
 # The source
 
 
-def test_the_source_is_under_68_kb():  # 6 kB of them turn a sky of up to 25 functions
+def test_the_source_is_under_86_kb():  # of which 6 turn a sky of up to 25 functions, and 17 gather light at rest
     text = page(LIGHT)
     carried = re.findall(
         r'<script type="(?:application/json" id="scene|text/plain" id="data)">(.*?)</script>', text, re.S
     )
     assert len(carried) == 2
-    assert len(text.encode()) - sum(map(len, carried)) < 68_000
+    assert len(text.encode()) - sum(map(len, carried)) < 86_000
 
 
 def test_modules_joined_into_one_keep_their_names_apart():
@@ -66,9 +66,9 @@ def test_a_name_cannot_leave_its_place():
 
 
 def test_shaders_never_discard_in_the_ray_loop():
-    body = source("field.frag")
+    body = source("march.glsl")
     loop = body[body.index("float march(") : body.index("vec3 gradient(")]
-    assert "discard" not in loop and "discard" in body and len(SHADERS) == 6
+    assert "break" in loop and "discard" not in body and len(SHADERS) == len(set(SHADERS)) == 15
 
 
 # What it carries

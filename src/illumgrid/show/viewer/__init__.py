@@ -24,9 +24,14 @@ MODULES = (
     "skies",
     "input",
     "picture",
+    "resting",
     "view",
 )  # each imports from earlier
-SHADERS = ("shared.glsl", "ray.vert", "field.frag", "wall.vert", "wall.frag", "copy.frag")
+SHADERS = (
+    "shared.glsl", "ray.vert", "march.glsl", "field.frag", "wall.vert", "wall.frag", "copy.frag",
+    "origin.frag", "origin_wall.frag", "gather.glsl", "gather_sky.frag", "gather.frag", "gather_wall.frag",
+    "blend.frag", "rest.frag",
+)  # fmt: skip
 
 
 @cache
@@ -75,7 +80,7 @@ def page(light: Illumination, up: str | None = None) -> str:
     Returns
     -------
     str
-        The file's text; about the size of the gzipped field and grid, times 4/3, and 66 KB.
+        The file's text; about the size of the gzipped field and grid, times 4/3, and 85 KB.
     """
     from illumgrid.show.viewer.packing import packed
 

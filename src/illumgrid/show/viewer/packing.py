@@ -21,7 +21,7 @@ from illumgrid.light import Illumination
 from illumgrid.show import trust
 from illumgrid.show.camera import HALF_ANGLE, fit_camera, outline_of
 from illumgrid.show.shade import BACKGROUND, CAP_TONE, fades
-from illumgrid.show.viewer import skies
+from illumgrid.show.viewer import resting, skies
 from illumgrid.show.viewer.arrays import (
     HOLE,
     Bytes,
@@ -250,6 +250,7 @@ def packed(light: Illumination, up: str | None = None) -> tuple[dict[str, Any], 
             "colors": [_css(color) for color in _between(trust.SCALE.astype(float))],
         },
         "sky": skies.described(light),
+        "resting": resting.described(light, list(kept_apart(light))),
         "lights": [{"name": name, "weight": weight} for name, weight in kept_apart(light).items()],
         "fields": fields,
         "walls": walls,

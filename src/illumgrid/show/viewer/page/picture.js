@@ -8,7 +8,7 @@ import { DEFAULTS, isovalueOf } from "./state.js";
 export const LOOKS = ["matte", "shiny", "translucent"];
 const LAYERS = 4; // surfaces behind one another that a translucent look shows
 
-function program(gl, vertex, fragment) {
+export function program(gl, vertex, fragment) {
   const built = gl.createProgram();
   const head = "#version 300 es\nprecision highp float;\nprecision highp int;\nprecision highp sampler3D;\nprecision highp usampler3D;\n";
   for (const [kind, text] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]]) {
@@ -30,9 +30,9 @@ function program(gl, vertex, fragment) {
   return { built, at };
 }
 
-function set(gl, { at }, values) {
+export function set(gl, { at }, values) {
   const how = {
-    [gl.FLOAT]: (p, v) => gl.uniform1f(p, v),
+    [gl.FLOAT]: (p, v) => (v.length ? gl.uniform1fv(p, v) : gl.uniform1f(p, v)),
     [gl.FLOAT_VEC2]: (p, v) => gl.uniform2fv(p, v),
     [gl.FLOAT_VEC3]: (p, v) => gl.uniform3fv(p, v),
     [gl.FLOAT_MAT4]: (p, v) => gl.uniformMatrix4fv(p, false, v),
@@ -49,7 +49,8 @@ export class Picture {
     const gl = canvas.getContext("webgl2", { alpha: false, antialias: false, powerPreference: "high-performance" });
     if (!gl) throw new Error("This page draws with WebGL2, which this browser or its graphics driver does not offer.");
     this.gl = gl;
-    if (!gl.getExtension("EXT_color_buffer_float") && !gl.getExtension("EXT_color_buffer_half_float")) {
+    this.single = gl.getExtension("EXT_color_buffer_float");
+    if (!this.single && !gl.getExtension("EXT_color_buffer_half_float")) {
       throw new Error("This page sums light in floating point, which this graphics driver cannot draw into.");
     }
     const largest = gl.getParameter(gl.MAX_3D_TEXTURE_SIZE);
@@ -59,7 +60,7 @@ export class Picture {
     }
     this.vertices = gl.createVertexArray();
     gl.bindVertexArray(this.vertices);
-    this.fieldProgram = program(gl, shaders["ray.vert"], shaders["shared.glsl"] + shaders["field.frag"]);
+    this.fieldProgram = program(gl, shaders["ray.vert"], shaders["shared.glsl"] + shaders["march.glsl"] + shaders["field.frag"]);
     this.wallProgram = program(gl, shaders["wall.vert"], shaders["shared.glsl"] + shaders["wall.frag"]);
     this.copyProgram = program(gl, shaders["ray.vert"], shaders["copy.frag"]);
     this.fields = scene.fields.map((field) => {
@@ -106,31 +107,35 @@ export class Picture {
     }
   }
 
-  // A place to draw into: half-float colour, and a depth that can be read back.
-  target(width, height, withDepth) {
-    const gl = this.gl, made = { frame: gl.createFramebuffer(), color: gl.createTexture() };
+  // A place to draw into: colours of these formats, half floats as a rule, and a depth that can be read back.
+  target(width, height, withDepth, formats = [this.gl.RGBA16F]) {
+    const gl = this.gl, made = { frame: gl.createFramebuffer() };
     gl.bindFramebuffer(gl.FRAMEBUFFER, made.frame);
-    const attach = (texture, format, filter, where) => {
+    const attach = (format, filter, where) => {
+      const texture = gl.createTexture();
       gl.bindTexture(gl.TEXTURE_2D, texture);
       gl.texStorage2D(gl.TEXTURE_2D, 1, format, width, height);
       for (const name of ["MIN_FILTER", "MAG_FILTER"]) gl.texParameteri(gl.TEXTURE_2D, gl[`TEXTURE_${name}`], filter);
       for (const name of ["WRAP_S", "WRAP_T"]) gl.texParameteri(gl.TEXTURE_2D, gl[`TEXTURE_${name}`], gl.CLAMP_TO_EDGE);
       gl.framebufferTexture2D(gl.FRAMEBUFFER, where, gl.TEXTURE_2D, texture, 0);
+      return texture;
     };
-    attach(made.color, gl.RGBA16F, gl.LINEAR, gl.COLOR_ATTACHMENT0);
-    if (withDepth) attach(made.depth = gl.createTexture(), gl.DEPTH_COMPONENT32F, gl.NEAREST, gl.DEPTH_ATTACHMENT);
+    made.colors = formats.map((format, k) => attach(format, format === gl.RGBA16F ? gl.LINEAR : gl.NEAREST, gl.COLOR_ATTACHMENT0 + k));
+    made.color = made.colors[0];
+    gl.drawBuffers(formats.map((_, k) => gl.COLOR_ATTACHMENT0 + k));
+    if (withDepth) made.depth = attach(gl.DEPTH_COMPONENT32F, gl.NEAREST, gl.DEPTH_ATTACHMENT);
     return made;
+  }
+
+  drop(old) {
+    this.gl.deleteFramebuffer(old.frame);
+    for (const texture of old.colors) this.gl.deleteTexture(texture);
+    if (old.depth) this.gl.deleteTexture(old.depth);
   }
 
   resize(width, height) {
     if (this.size[0] === width && this.size[1] === height) return;
-    const gl = this.gl;
-    for (const old of [...(this.layers ?? []), this.sum, this.mean]) {
-      if (!old) continue;
-      gl.deleteFramebuffer(old.frame);
-      gl.deleteTexture(old.color);
-      if (old.depth) gl.deleteTexture(old.depth);
-    }
+    for (const old of [...(this.layers ?? []), this.sum, this.mean]) if (old) this.drop(old);
     this.size = [width, height];
     this.layers = [this.target(width, height, true), this.target(width, height, true)];
     this.sum = this.target(width, height, false);
@@ -169,32 +174,46 @@ export class Picture {
     gl.useProgram(this.fieldProgram.built);
     set(gl, this.fieldProgram, common);
     scene.fields.forEach((field, k) => {
-      set(gl, this.fieldProgram, {
-        uField: this.bind(0, gl.TEXTURE_3D, this.fields[k].values),
-        uBricks: this.bind(1, gl.TEXTURE_3D, this.fields[k].bricks),
-        uLight: this.bind(2, gl.TEXTURE_3D, this.fields[k].light),
-        uToIndex: field.toIndex,
-        uToTexture: field.toTexture,
-        uLevel: (this.level(field, state.sweep) - field.values.base) / field.values.step,
-        uAlbedo: field.albedo,
-        uGrey: field.light.channels === 1 ? 1 : 0,
-        uBothSides: translucent ? 1 : 0,
-      });
+      set(gl, this.fieldProgram, { ...this.fieldTextures(k), ...this.fieldUniforms(field, k, state), uBothSides: translucent ? 1 : 0 });
       gl.drawArrays(gl.TRIANGLES, 0, 3);
     });
     gl.useProgram(this.wallProgram.built);
-    set(gl, this.wallProgram, { ...common, uLook: 0, uGrey: scene.atlas?.channels === 1 ? 1 : 0 });
+    set(gl, this.wallProgram, { ...common, uLook: 0 });
     for (const wall of scene.walls) {
       if (dot(wall.normal, sum([1, seen.uEye], [-1, wall.corner])) <= 0) continue; // walls are drawn from their front only
-      set(gl, this.wallProgram, {
-        uWalls: this.bind(0, gl.TEXTURE_3D, this.walls),
-        uCorner: wall.corner, uEdgeU: wall.edgeU, uEdgeV: wall.edgeV, uNormal: wall.normal,
-        uTexels: wall.texels, uOffset: wall.offset,
-        uRow: (state.sweep * (scene.atlas.shape[2] - 1) + 0.5) / scene.atlas.shape[2],
-        uAlbedo: wall.albedo, uEmission: wall.emission, uLocalColor: wall.localColor, uGround: wall.fades ? scene.background : -1,
-      });
+      set(gl, this.wallProgram, { ...this.wallTextures(), ...this.wallUniforms(wall, state) });
       gl.drawArrays(gl.TRIANGLE_STRIP, 0, 4);
     }
+  }
+
+  fieldTextures(k) {
+    const { values, bricks: held, light } = this.fields[k], gl = this.gl;
+    return { uField: this.bind(0, gl.TEXTURE_3D, values), uBricks: this.bind(1, gl.TEXTURE_3D, held), uLight: this.bind(2, gl.TEXTURE_3D, light) };
+  }
+
+  fieldUniforms(field, k, { sweep }) {
+    return {
+      uToIndex: field.toIndex,
+      uToTexture: field.toTexture,
+      uLevel: (this.level(field, sweep) - field.values.base) / field.values.step,
+      uAlbedo: field.albedo,
+      uGrey: field.light.channels === 1 ? 1 : 0,
+    };
+  }
+
+  wallTextures() {
+    return { uWalls: this.bind(0, this.gl.TEXTURE_3D, this.walls) };
+  }
+
+  wallUniforms(wall, { sweep }) {
+    const { atlas } = this.scene;
+    return {
+      uCorner: wall.corner, uEdgeU: wall.edgeU, uEdgeV: wall.edgeV, uNormal: wall.normal,
+      uTexels: wall.texels, uOffset: wall.offset,
+      uRow: (sweep * (atlas.shape[2] - 1) + 0.5) / atlas.shape[2],
+      uAlbedo: wall.albedo, uEmission: wall.emission, uLocalColor: wall.localColor, uGround: wall.fades ? this.scene.background : -1,
+      uGrey: atlas.channels === 1 ? 1 : 0,
+    };
   }
 
   // Isovalue of a field at this place of the sweep, upwards.
@@ -215,19 +234,25 @@ export class Picture {
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 
-  // Add one sample to the mean of `count` before it, at a place (0 to 1) within the pixel; `width` x `height` in all.
-  sample(state, width, height, place, count) {
-    const gl = this.gl, { scene } = this;
-    this.resize(width, height);
-    gl.viewport(0, 0, width, height);
-    const { right, up, forward } = facing(state.view, scene.axes);
+  // The camera, at a place (0 to 1) within the pixels.
+  seen({ view }, width, height, place) {
+    const { scene } = this, { right, up, forward } = facing(view, scene.axes);
     const tall = scene.tangent, wide = (tall * width) / height;
-    const seen = {
-      uEye: eyeOf(state.view, scene.axes),
+    return {
+      uEye: eyeOf(view, scene.axes),
       uRight: sum([wide, right]), uUp: sum([tall, up]), uForward: forward,
       uJitter: [(2 * place[0] - 1) / width, (2 * place[1] - 1) / height],
       uLamp: sum([-0.72, forward], [0.38, right], [0.58, up]),
     };
+  }
+
+  // Add one sample to the mean of `count` before it, at a place within the pixel; `width` x `height` in all. Into `raw`,
+  // if it is given, goes what the tone curve has not seen.
+  sample(state, width, height, place, count, raw = null) {
+    const gl = this.gl, { scene } = this;
+    this.resize(width, height);
+    gl.viewport(0, 0, width, height);
+    const seen = { ...this.seen(state, width, height, place), uRaw: raw ? 1 : 0 };
     let drawn = this.layers[0];
     this.layer(drawn, null, seen, state);
     if (state.look === "translucent" && !state.trust) {
@@ -247,7 +272,7 @@ export class Picture {
       drawn = this.sum;
     }
     const share = 1 / (count + 1);
-    this.copy(drawn, this.mean.frame, count === 0 ? null : () => {
+    this.copy(drawn, (raw ?? this.mean).frame, count === 0 ? null : () => {
       gl.blendColor(share, share, share, share);
       gl.blendFunc(gl.CONSTANT_COLOR, gl.ONE_MINUS_CONSTANT_COLOR);
     });

@@ -10,7 +10,10 @@ uniform vec2 uTrust;                 // relative errors at the ends of the scale
 uniform vec3 uScale[5], uHatch[2];   // its colours, in equal steps of the logarithm, and those of holes
 uniform vec3 uLamp;                  // direction to the lamp of the shiny look, beside the eye
 
-out vec4 color_;
+uniform bool uRaw;                   // no tone curve
+uniform float uGround;               // display radiance of the background, into which a floor under the sky fades; else below 0
+
+layout(location = 0) out vec4 color_;
 
 float depthOf(float t) { return t / (1.0 + t); }
 float distanceOf(float depth) { return depth / (1.0 - depth); }
@@ -19,12 +22,15 @@ bool isTrust() { return uTrust.y > 0.0; }
 vec3 lightOf(vec4 texel) { return max(uGrey ? texel.rrr : texel.rgb, 0.0); }
 float errorOf(vec4 texel) { return uGrey ? texel.g : texel.a; }
 
-void draw(vec3 color, float alpha) { color_ = vec4(clamp(color, 0.0, 1.0) * alpha, alpha); }
+// How much of a wall is left of it, as it fades into the background.
+float groundShare(vec2 place) { return uGround < 0.0 ? 1.0 : smoothstep(0.0, 0.6, 1.0 - length(2.0 * place - 1.0)); }
+
+void draw(vec3 color, float alpha) { color_ = vec4(clamp(color, 0.0, uRaw ? 65504.0 : 1.0) * alpha, alpha); }
 
 // Exposed radiance as the screen shows it: `curve` of illumgrid.tone.
 vec3 curve(vec3 light) {
   float peak = max(light.r, max(light.g, light.b)), room = 1.0 - uWhite;
-  if (peak <= uWhite) return light;
+  if (uRaw || peak <= uWhite) return light;
   float rolled = 1.0 - room * room / (peak - uWhite + room), faded = 1.0 - 1.0 / (0.15 * (peak - rolled) + 1.0);
   return rolled * mix(light / peak, vec3(1.0), faded);
 }

@@ -1,6 +1,6 @@
 // What the page shows, and the same in its address.
 
-export const DEFAULTS = { sweep: 0.5, light: "global", split: 0.5, stops: 0, look: "matte", trust: false, turn: [0, 0] };
+export const DEFAULTS = { sweep: 0.5, light: "global", split: 0.5, stops: 0, look: "matte", trust: false, rest: true, turn: [0, 0] };
 
 const short = (x) => String(Number(x.toPrecision(6)));
 export const clamp = (x, low, high) => Math.min(high, Math.max(low, x));
@@ -19,6 +19,7 @@ export function written(state, scene) {
   if (state.look !== DEFAULTS.look) parts.push(`look=${state.look}`);
   if (state.stops) parts.push(`stops=${short(state.stops)}`);
   if (state.trust) parts.push("trust=1");
+  if (!state.rest) parts.push("rest=0");
   if (String(state.turn) !== String(DEFAULTS.turn)) parts.push(`turn=${state.turn.map(short).join(",")}`);
   if (scene.lights.some(({ weight }, k) => weight !== state.weights[k])) parts.push(`weights=${state.weights.map(short).join(",")}`);
   return parts.join("&");
@@ -42,5 +43,6 @@ export function read(address, scene, looks) {
   if (number("split") !== null) state.split = clamp(number("split"), 0, 1);
   if (number("stops") !== null) state.stops = clamp(number("stops"), -3, 3);
   if (given.get("trust") === "1") state.trust = true;
+  if (given.get("rest") === "0") state.rest = false;
   return state;
 }

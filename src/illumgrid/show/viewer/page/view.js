@@ -4,6 +4,7 @@ import { fitted } from "./camera.js";
 import { listen, listenSplit } from "./input.js";
 import { lights } from "./lights.js";
 import { LOOKS, Picture } from "./picture.js";
+import { PLACES, Resting } from "./resting.js";
 import { skyBall } from "./skies.js";
 import { DEFAULTS, clamp, isovalueOf, read, written } from "./state.js";
 import { formatted, sweeps } from "./sweeps.js";
@@ -12,18 +13,13 @@ const REST = 160; // milliseconds without a change until a full frame is drawn
 const SMOOTH = 30; // milliseconds per frame during interaction
 const QUICK = 60; // frames faster than this are refined beyond the four samples of a still picture
 
-// Places within the pixel: first the middles of its four quarters, as in a still picture of the package, then between.
-const PLACES = [[0.25, 0.25], [0.75, 0.75], [0.75, 0.25], [0.25, 0.75]].concat(
-  [...Array(12).keys()].map((k) => [(0.5 + 0.7548777 * (k + 1)) % 1, (0.5 + 0.5698403 * (k + 1)) % 1]),
-);
-
 // Runs the view in `root`, which holds the markup. Options: address (keep the state there), onChange (called with the state).
 export function view(root, scene, data, shaders, { address = true, onChange = () => {} } = {}) {
   const part = (name) => root.querySelector(`[data-part="${name}"]`);
   const canvas = part("canvas"), stage = part("stage");
-  const picture = new Picture(canvas, scene, data, shaders);
+  const picture = new Picture(canvas, scene, data, shaders), resting = Resting.of(picture, shaders);
   const opened = { ...DEFAULTS, weights: scene.lights.map((light) => light.weight) }, state = { ...opened };
-  let changed = -Infinity, samples = 0, coarse = 2, asked = false, written_ = "", fresh = true;
+  let changed = -Infinity, samples = 0, coarse = 2, asked = false, written_ = "", fresh = true, rests = false;
 
   const aspect = () => Math.max(stage.clientWidth, 1) / Math.max(stage.clientHeight, 1);
   const whole = () => ({ ...fitted(scene.opening, scene.axes, aspect(), scene.tangent), moved: false });
@@ -47,6 +43,8 @@ export function view(root, scene, data, shaders, { address = true, onChange = ()
     part("stops").value = state.stops;
     part("stopsShown").value = `${state.stops > 0 ? "+" : state.stops < 0 ? "\u2212" : "\u00b1"}${Math.abs(state.stops).toFixed(1)} EV`;
     part("trust").checked = state.trust;
+    part("rest").checked = state.rest;
+    part("refine").hidden = !resting;
     part("legend").hidden = !state.trust;
     part("split").hidden = state.light !== "both" || state.trust;
     part("split").style.left = `${100 * state.split}%`;
@@ -61,13 +59,14 @@ export function view(root, scene, data, shaders, { address = true, onChange = ()
     state.split = clamp(state.split, 0, 1);
     changed = performance.now();
     samples = 0;
+    rests = false;
     controls();
     draw();
     onChange(state);
   }
 
-  function draw() {
-    canvas.setAttribute("aria-busy", "true");
+  function draw(busy = true) {
+    if (busy) canvas.setAttribute("aria-busy", "true");
     if (!asked) requestAnimationFrame(frame);
     asked = true;
   }
@@ -80,12 +79,17 @@ export function view(root, scene, data, shaders, { address = true, onChange = ()
       canvas.height = height;
       if (!state.view.moved) state.view = whole();
       samples = 0;
+      rests = false;
     }
   }
 
   function frame() {
     asked = false;
     size();
+    if (rests) {
+      rest();
+      return;
+    }
     picture.mix(state);
     const moving = !fresh && performance.now() - changed < REST;
     const begun = performance.now(), divide = moving ? coarse : 1;
@@ -106,7 +110,22 @@ export function view(root, scene, data, shaders, { address = true, onChange = ()
     else still();
   }
 
+  // Gathered light, while nothing changes: browsers ask for no frames of pages that are hidden.
+  function rest() {
+    if (!resting.done) resting.step(state);
+    resting.show(state.stops);
+    picture.wait();
+    part("rays").value = `${resting.rays} rays a pixel`;
+    if (!resting.done) draw(false);
+  }
+
   function still() {
+    rests = resting && state.rest && state.light === "global" && state.look === "matte" && !state.trust;
+    part("rays").value = "";
+    if (rests) {
+      resting.begin(state, canvas.width, canvas.height, view_.took);
+      draw(false);
+    }
     canvas.setAttribute("aria-busy", "false");
     if (!address) return;
     written_ = written(state, scene);
@@ -120,7 +139,8 @@ export function view(root, scene, data, shaders, { address = true, onChange = ()
   }
 
   function save() {
-    picture.show();
+    if (rests) resting.show(state.stops);
+    else picture.show();
     canvas.toBlob((blob) => {
       const link = document.createElement("a");
       link.href = URL.createObjectURL(blob);
@@ -139,6 +159,7 @@ export function view(root, scene, data, shaders, { address = true, onChange = ()
   }
   part("stops").addEventListener("input", () => put({ stops: Number(part("stops").value) }));
   part("trust").addEventListener("change", () => put({ trust: part("trust").checked }));
+  part("rest").addEventListener("change", () => put({ rest: part("rest").checked }));
   part("reset").addEventListener("click", reset);
   part("save").addEventListener("click", save);
   canvas.addEventListener("webglcontextlost", () => complain(root, "The graphics card was reset. Reload the page to continue."));
@@ -150,7 +171,7 @@ export function view(root, scene, data, shaders, { address = true, onChange = ()
   part("legend").style.setProperty("--scale", `linear-gradient(90deg, ${scene.trust.colors.join(", ")})`);
   part("notes").replaceChildren(...scene.notes.map((text) => Object.assign(document.createElement("p"), { textContent: text })));
   new ResizeObserver(draw).observe(stage);
-  const view_ = { state, put, picture, took: 0 };
+  const view_ = { state, put, picture, resting, took: 0 };
   if (address) {
     Object.assign(state, read(location.hash.slice(1), scene, LOOKS));
     globalThis.addEventListener("hashchange", follow);

@@ -5,7 +5,6 @@ uniform vec2 uTexels, uOffset;       // of this wall, within the texture of all
 uniform float uRow;                  // texture coordinate of the sweep
 uniform vec3 uAlbedo, uEmission;     // emission as the exposure shows it
 uniform vec3 uLocalColor;
-uniform float uGround;               // display radiance of the background, into which a floor under the sky fades; else below 0
 uniform sampler2D uFront;
 uniform bool uPeel;
 
@@ -13,8 +12,7 @@ in vec3 vRay;
 in vec2 vPlace;
 
 void finish(vec3 color) {
-  float share = uGround < 0.0 ? 1.0 : smoothstep(0.0, 0.6, 1.0 - length(2.0 * vPlace - 1.0));
-  draw(mix(vec3(uGround), color, share), 1.0);
+  draw(mix(vec3(uGround), color, groundShare(vPlace)), 1.0);
 }
 
 void main() {

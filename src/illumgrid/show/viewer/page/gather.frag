@@ -1,0 +1,19 @@
+// What gathered rays meet of one field: the light that its grid holds there, or for shadow rays nothing but the shadow.
+uniform float uId;
+
+void main() {
+  Ray ray = gathered();
+  if (ray.id < 0.0 || ray.worth <= 0.0) discard;
+  vec3 start = (uToIndex * vec4(ray.start, 1.0)).xyz, ahead = mat3(uToIndex) * ray.ahead;
+  int what = SURFACE;
+  float t = 0.0;
+  ivec3 cell = clamp(ivec3(floor(start)), ivec3(0), textureSize(uField, 0) - 2);
+  vec4 near, far;
+  corners(cell, near, far);
+  bool dips = ray.id == uId && cubic(near, far, start - vec3(cell), ahead).y > 0.0;   // under the surface that it leaves
+  if (!dips) t = march(start, ahead, 0.0, what);
+  if (what == NOTHING || t >= ray.reach) discard;
+  gl_FragDepth = depthOf(t);
+  vec3 texel = (uToTexture * vec4(ray.start + t * ray.ahead, 1.0)).xyz;
+  color_ = vec4(uAim == OPEN ? uAlbedo * lightOf(texture(uLight, texel)) : vec3(0.0), 1.0);
+}

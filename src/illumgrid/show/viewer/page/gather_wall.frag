@@ -1,0 +1,19 @@
+// What gathered rays meet of one wall.
+uniform sampler3D uWalls;
+uniform vec3 uCorner, uEdgeU, uEdgeV, uNormal, uAlbedo;
+uniform vec2 uTexels, uOffset;
+uniform float uRow, uId;
+
+void main() {
+  Ray ray = gathered();
+  if (ray.id < 0.0 || ray.id == uId || ray.worth <= 0.0) discard;
+  float toward = dot(ray.ahead, uNormal), t = dot(uCorner - ray.start, uNormal) / toward;
+  vec3 within = ray.start + t * ray.ahead - uCorner;
+  mat2 gram = mat2(dot(uEdgeU, uEdgeU), dot(uEdgeU, uEdgeV), dot(uEdgeU, uEdgeV), dot(uEdgeV, uEdgeV));
+  vec2 place = inverse(gram) * vec2(dot(within, uEdgeU), dot(within, uEdgeV));
+  if (!(t > 0.0 && t < ray.reach && place == clamp(place, 0.0, 1.0))) discard;
+  gl_FragDepth = depthOf(t);
+  vec2 texel = uOffset + clamp(place * uTexels, vec2(0.5), uTexels - 0.5);
+  vec3 light = lightOf(texture(uWalls, vec3(texel / vec2(textureSize(uWalls, 0).xy), uRow)));
+  color_ = vec4(uAim == OPEN && toward < 0.0 ? uAlbedo * light : vec3(0.0), 1.0);   // its back is dark
+}

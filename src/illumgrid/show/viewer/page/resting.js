@@ -1,0 +1,211 @@
+// While nothing moves, rays from every pixel gather light; see gather.glsl. A ray ends where it meets a surface, in the
+// light that is stored there, so that few suffice; until there are enough, the picture is mostly that of the lookup.
+
+import { dot, eyeOf, facing, sum } from "./camera.js";
+import { program, set } from "./picture.js";
+import { skyTurned } from "./skies.js";
+
+export const PLACES = [[0.25, 0.25], [0.75, 0.75], [0.75, 0.25], [0.25, 0.75]].concat( // within the pixel, as in a still picture of the package, then between
+  [...Array(12).keys()].map((k) => [(0.5 + 0.7548776 * (k + 1)) % 1, (0.5 + 0.5698403 * (k + 1)) % 1]),
+);
+const MOST = 4096; // rays from each pixel
+const FINE = 1 / 500; // standard error, in display radiance, at which the picture is done
+const TRIAL = [96, 72], RAYS = 8; // pixels, and rays from each in either half of a trial
+const ENOUGH = 64; // pixels on which a surface is judged by itself
+const BAND = 30; // milliseconds for a part of a slow picture
+const OPEN = 0, DISC = 1, LAMP = 2;
+
+export class Resting {
+  // Null where the page cannot: light that it holds no description of, or a graphics card without single precision.
+  static of(picture, shaders) {
+    return picture.scene.resting && picture.single ? new Resting(picture, shaders) : null;
+  }
+
+  constructor(picture, shaders) {
+    const { gl } = picture, shared = shaders["shared.glsl"], march = shared + shaders["march.glsl"], ray = shaders["ray.vert"];
+    Object.assign(this, { picture, gl, scene: picture.scene, key: "", size: "" });
+    this.programs = {
+      origin: program(gl, ray, march + shaders["origin.frag"]),
+      originWall: program(gl, shaders["wall.vert"], shared + shaders["origin_wall.frag"]),
+      sky: program(gl, ray, shared + shaders["gather.glsl"] + shaders["gather_sky.frag"]),
+      field: program(gl, ray, march + shaders["gather.glsl"] + shaders["gather.frag"]),
+      wall: program(gl, ray, shared + shaders["gather.glsl"] + shaders["gather_wall.frag"]),
+      blend: program(gl, ray, shaders["blend.frag"]),
+      show: program(gl, ray, shared + shaders["rest.frag"]),
+    };
+    this.surfaces = [...this.scene.fields, ...this.scene.walls];
+    this.trial = this.targets(...TRIAL);
+  }
+
+  targets(width, height) {
+    const { gl, picture } = this, single = gl.RGBA32F;
+    return {
+      width, height,
+      origin: picture.target(width, height, true, [single, single, gl.RGBA16F]),
+      ray: picture.target(width, height, true),
+      found: picture.target(width, height, false),
+      means: [picture.target(width, height, false, [single]), picture.target(width, height, false, [single])],
+    };
+  }
+
+  // Start again at what `state` shows, unless only the exposure is another; `took` milliseconds a frame of lookups takes.
+  begin(state, width, height, took) {
+    const { picture } = this, size = String([width, height]);
+    if (this.size !== size) {
+      if (this.whole) [this.whole.origin, this.whole.ray, this.whole.found, ...this.whole.means, this.raw].forEach((old) => picture.drop(old));
+      Object.assign(this, { size, whole: this.targets(width, height), raw: picture.target(width, height, false), key: "" });
+    }
+    PLACES.slice(0, 4).forEach((place, k) => picture.sample(state, width, height, place, k, this.raw));
+    const key = JSON.stringify([size, state.view, state.sweep, state.weights, state.turn]);
+    if (key === this.key) return;
+    this.key = key;
+    this.bands = Array(Math.max(1, Math.min(32, Math.ceil((3 * took) / BAND)))).fill(0);
+    this.next = 0;
+    this.judge(state);
+  }
+
+  get rays() {
+    return Math.min(...this.bands);
+  }
+
+  get done() {
+    return this.rays >= this.enough;
+  }
+
+  // One more ray from every pixel of the next band.
+  step(state) {
+    const { gl } = this;
+    gl.enable(gl.SCISSOR_TEST);
+    this.scissor(this.next);
+    this.gather(this.whole, state, this.bands[this.next], PLACES[this.bands[this.next] % PLACES.length], false);
+    this.bands[this.next] += 1;
+    this.next = (this.next + 1) % this.bands.length;
+    gl.disable(gl.SCISSOR_TEST);
+  }
+
+  scissor(band) {
+    const { width, height } = this.whole, [low, high] = [band, band + 1].map((k) => Math.round((k * height) / this.bands.length));
+    this.gl.scissor(0, low, width, high - low);
+  }
+
+  show(stops) {
+    const { gl, picture } = this, { built } = this.programs.show;
+    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+    gl.viewport(0, 0, this.whole.width, this.whole.height);
+    gl.disable(gl.DEPTH_TEST);
+    gl.disable(gl.BLEND);
+    gl.enable(gl.SCISSOR_TEST);
+    gl.useProgram(built);
+    this.bands.forEach((rays, band) => {
+      this.scissor(band);
+      set(gl, this.programs.show, {
+        uStill: picture.bind(0, gl.TEXTURE_2D, picture.mean.color), uLinear: picture.bind(1, gl.TEXTURE_2D, this.raw.color),
+        uMean: picture.bind(2, gl.TEXTURE_2D, this.whole.means[rays % 2].color),
+        uRays: rays, uWhite: this.scene.white, uGain: 2 ** stops, uForward: [0, 0, 1], uRight: [1, 0, 0], uUp: [0, 1, 0],
+      });
+      gl.drawArrays(gl.TRIANGLES, 0, 3);
+    });
+    gl.disable(gl.SCISSOR_TEST);
+  }
+
+  // What the rays and the lookups of each surface are worth, from rays of their own: weights that depended on the rays
+  // they weigh would darken the picture. Two independent answers tell apart what rays and what lookups are off by.
+  judge(state) {
+    const { gl, trial } = this, many = trial.width * trial.height;
+    const read = (target, into = new Float32Array(4 * many)) => {
+      gl.bindFramebuffer(gl.FRAMEBUFFER, target.frame);
+      gl.readPixels(0, 0, trial.width, trial.height, gl.RGBA, gl.FLOAT, into);
+      return into;
+    };
+    const [one, other] = [0, 1].map((half) => {
+      for (let k = 0; k < RAYS; k++) this.gather(trial, state, k, [0.5, 0.5], true, MOST + RAYS * half);
+      return read(trial.means[RAYS % 2]);
+    });
+    const place = read(trial.origin), sums = [...this.surfaces, null].map(() => [0, 0, 0, 0]);
+    for (let i = 0; i < many; i++) {
+      const id = place[4 * i + 3];
+      if (id < 0) continue;
+      for (const total of [sums[id], sums[this.surfaces.length]]) {
+        for (let j = 4 * i; j < 4 * i + 3; j++) {
+          total[0] += (RAYS * 0.5 * (one[j] - other[j]) ** 2) / 3;
+          total[1] += (one[j] * other[j]) / 3;
+        }
+        total[2] += one[4 * i + 3];
+        total[3] += 1;
+      }
+    }
+    const all = sums.pop();
+    const judged = sums.map((own) => (own[3] >= ENOUGH ? own : all)).map(([ray, lookup, usual, n]) => [ray, Math.max(lookup, 0), usual].map((x) => x / Math.max(n, 1)));
+    this.trust = judged.flat();
+    this.enough = Math.max(64, Math.min(MOST, Math.ceil(Math.max(...judged.map(([ray]) => ray)) / FINE ** 2)));
+  }
+
+  // Lights that rays ask for one by one, at their weights.
+  aims({ weights }) {
+    const weighed = ({ light, color }) => color.map((x) => x * (light < 0 ? 1 : weights[light]));
+    return [
+      { uAim: OPEN },
+      ...this.scene.resting.discs.map((disc) => ({ uAim: DISC, uAxis: disc.axis, uCosine: disc.cosine, uShine: weighed(disc) })),
+      ...this.scene.resting.lamps.map((lamp) => {
+        const wall = this.scene.walls[lamp.wall];
+        return { uAim: LAMP, uLamp0: wall.corner, uLampU: wall.edgeU, uLampV: wall.edgeV, uLampNormal: wall.normal, uShine: weighed(lamp) };
+      }),
+    ];
+  }
+
+  sky({ weights, turn }) {
+    const { scene } = this, total = Array(25).fill([0, 0, 0]);
+    const add = (coefficients, share) => coefficients.forEach((c, b) => (total[b] = sum([1, total[b]], [share, c])));
+    for (const { light, coefficients } of scene.resting.skies) add(coefficients, light < 0 ? 1 : weights[light]);
+    if (scene.sky) add(skyTurned(scene.sky.coefficients, turn), scene.sky.exposure);
+    return { "uSky[0]": total.flat(), "uSkyAxes[0]": scene.resting.axes.flat() };
+  }
+
+  // One ray from every pixel at these places within them, into the mean over `count` rays before.
+  gather(into, state, count, place, isTrial, first = 0) {
+    const { gl, picture, scene, programs } = this, { width, height } = into;
+    gl.viewport(0, 0, width, height);
+    const seen = picture.seen(state, width, height, place);
+    const fields = scene.fields.map((field, k) => ({ ...picture.fieldUniforms(field, k, state), uId: k }));
+    const walls = scene.walls.map((wall, k) => ({ ...picture.wallUniforms(wall, state), uId: scene.fields.length + k }));
+    const draw = (made, uniforms, kind = gl.TRIANGLES, vertices = 3) => {
+      gl.useProgram(made.built);
+      set(gl, made, uniforms);
+      gl.drawArrays(kind, 0, vertices);
+    };
+    const clear = (target, depth, alpha) => {
+      gl.bindFramebuffer(gl.FRAMEBUFFER, target.frame);
+      gl.disable(gl.BLEND);
+      gl[depth ? "enable" : "disable"](gl.DEPTH_TEST);
+      gl.clearColor(0, 0, 0, alpha);
+      gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
+    };
+    clear(into.origin, true, -1);
+    fields.forEach((own, k) => draw(programs.origin, { ...seen, ...own, ...picture.fieldTextures(k) }));
+    walls.forEach((own, k) => {
+      if (dot(own.uNormal, sum([1, seen.uEye], [-1, own.uCorner])) > 0) draw(programs.originWall, { ...seen, ...own, ...picture.wallTextures() }, gl.TRIANGLE_STRIP, 4);
+    });
+    clear(into.found, false, 0);
+    const number = first + count, flat = { uForward: [0, 0, 1], uRight: [1, 0, 0], uUp: [0, 1, 0], uJitter: [0, 0] };
+    for (const aim of this.aims(state)) {
+      const ray = { ...flat, ...aim, uTurn: [0.7548776662466927, 0.5698402909980532].map((x) => (0.5 + number * x) % 1) };
+      const origins = () => ({ uPlace: picture.bind(3, gl.TEXTURE_2D, into.origin.colors[0]), uNormals: picture.bind(4, gl.TEXTURE_2D, into.origin.colors[1]) });
+      clear(into.ray, true, 0);
+      gl.depthFunc(gl.LEQUAL);
+      draw(programs.sky, { ...ray, ...this.sky(state), ...origins() });
+      gl.depthFunc(gl.LESS);
+      fields.forEach((own, k) => draw(programs.field, { ...ray, ...own, ...picture.fieldTextures(k), ...origins() }));
+      walls.forEach((own) => draw(programs.wall, { ...ray, ...own, ...picture.wallTextures(), ...origins() }));
+      picture.copy(into.ray, into.found.frame, () => gl.blendFunc(gl.ONE, gl.ONE));
+    }
+    gl.bindFramebuffer(gl.FRAMEBUFFER, into.means[(count + 1) % 2].frame);
+    gl.disable(gl.BLEND);
+    const bound = (unit, texture) => picture.bind(unit, gl.TEXTURE_2D, texture);
+    draw(programs.blend, {
+      ...flat,
+      uOld: bound(0, into.means[count % 2].color), uFound: bound(1, into.found.color), uKnown: bound(2, into.origin.colors[2]),
+      uPlace: bound(3, into.origin.colors[0]), uNormals: bound(4, into.origin.colors[1]),
+      uShare: 1 / (count + 1), uTrial: isTrial ? 1 : 0, "uTrust[0]": this.trust ?? [0], "uAlbedos[0]": this.surfaces.flatMap((s) => s.albedo),
+    });
+  }
+}

@@ -1,0 +1,88 @@
+"""The page at rest: rays from every pixel make it the exact picture, and start from that of the lookup."""
+
+import base64
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.ndimage import binary_erosion
+
+import illumgrid as ig
+from browser import bent, browser, coloured, decoded, pair, still, until  # noqa: F401
+from illumgrid.field.lights import Sky
+from illumgrid.field.scene import Material
+from illumgrid.show.exact import Exact
+from illumgrid.show.viewer.packing import packed
+from illumgrid.tone import decode_srgb
+
+pytestmark = pytest.mark.filterwarnings("default")  # of the browser's driver
+RAYS = 8
+
+
+def balls():
+    """Some that touch and shade one another, lit by a grid too coarse for their shadows."""
+    place = np.stack(np.meshgrid(*[np.linspace(-1, 1, 24)] * 3, indexing="ij"), axis=-1)
+    middles, sizes = np.random.default_rng(0).uniform(-0.5, 0.5, (6, 3)), (0.05, 0.2, 0.1, 0.15, 0.07, 0.18)
+    height = sum(np.exp(-((place - m) ** 2).sum(axis=-1) / s) for m, s in zip(middles, sizes))
+    return ig.Volume((height / height.max()).astype(np.float32))
+
+
+def at_rest(browser, rays):  # noqa: F811
+    """Pixels once so many rays have left every pixel."""
+    until(browser.page, f"illumgrid.resting.rays >= {rays} || illumgrid.resting.done")
+    script = "(illumgrid.resting.show(illumgrid.state.stops), document.querySelector('canvas').toDataURL())"
+    return decoded(base64.b64decode(browser.page.evaluate(script).split(",")[1]))
+
+
+@pytest.mark.parametrize("kind", ["studio", "box"])
+def test_rays_take_away_what_the_lookup_is_off(browser, kind):  # noqa: F811
+    light = ig.run(getattr(ig.Scene, kind)(balls()), grid=10, paths=64, seed=0, judge=False)
+    looked_up, address, covered = still(light, 0.5)
+    wanted, _, _ = still(light, 0.5, exact=Exact(64))
+    for page in browser.folder.glob("*.html"):  # of the scene before, whose field has the same name
+        page.unlink()
+    browser.open(light, address, rest=True)
+    assert not browser.troubles
+    inner = binary_erosion(covered, iterations=2)  # outlines are sampled at other places
+    before, now, truth = (decode_srgb(x[inner].astype(np.uint8)) for x in (looked_up, at_rest(browser, RAYS), wanted))
+    off = np.sqrt(np.square(now - truth).mean()), np.sqrt(np.square(before - truth).mean())
+    assert off[0] < 0.8 * off[1]
+    noise = np.sqrt(np.square(now - truth).mean() / len(truth))
+    kept = 0.8 * abs(before.mean() - truth.mean())  # of what the lookup is off, which counts as some rays
+    assert abs(now.mean() - truth.mean()) < kept + 0.003 * truth.mean() + 3 * noise
+
+
+def test_only_what_changes_the_light_starts_the_rays_again(browser):  # noqa: F811
+    page = browser.open(coloured(pair()), rest=True)
+    at_rest(browser, 3)
+    page.evaluate("illumgrid.put({ stops: 0.5 })")
+    browser.settle()
+    assert page.evaluate("illumgrid.resting.rays") >= 3
+    page.evaluate("illumgrid.put({ sweep: 0.45 })")
+    browser.settle()
+    assert page.evaluate("illumgrid.resting.rays") < 3
+    page.locator('[data-part="rest"]').uncheck()
+    browser.settle()
+    assert page.url.endswith("&rest=0") and page.locator('[data-part="rays"]').inner_text() == ""
+    assert not browser.troubles
+
+
+def test_pages_that_cannot_gather_have_no_switch_for_it(browser):  # noqa: F811
+    scene = replace(bent(), lights=(Sky("image", np.ones((2, 4, 3))),))
+    assert packed(coloured(scene))[0]["resting"] is None
+    (field,) = bent().fields
+    shining = replace(bent(), fields=(replace(field, name="shining", material=Material((0.5,) * 3, (1.0, 0, 0))),))
+    light = coloured(shining)
+    assert packed(light)[0]["resting"] is None
+    assert not browser.open(light, rest=True).locator('[data-part="refine"]').is_visible()
+
+
+def test_lights_that_rays_ask_for_carry_their_exposure_and_weights():
+    scene = replace(pair(), background=np.array([0.2, 0.1, 0.3]))
+    light = coloured(scene)
+    held = packed(light)[0]["resting"]
+    (sky,) = held["skies"]
+    np.testing.assert_allclose(np.array(sky["coefficients"][0]) / np.sqrt(4 * np.pi), light.exposure * scene.background)
+    lamps = [k for k, quad in enumerate(scene.quads) if quad.material.emission.any()]
+    assert [lamp["wall"] for lamp in held["lamps"]] == lamps and len(lamps) == 1
+    np.testing.assert_allclose(held["lamps"][0]["color"], light.exposure * scene.quads[lamps[0]].material.emission)
