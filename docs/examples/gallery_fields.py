@@ -1,6 +1,10 @@
 """Volumes for the gallery: real ones if ``../shared/volumes`` exists beside the project, synthetic ones otherwise."""
 
+import shlex
+import subprocess
+import sys
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 
@@ -9,6 +13,9 @@ from illumgrid.field.builtin import spread
 from illumgrid.field.volume import smooth
 
 HERE = Path.cwd()
+_runs = TemporaryDirectory(prefix="illumgrid-gallery-")
+RUNS = Path(_runs.name)
+"""The folder in which the commands of the gallery run."""
 PLACES = [parent / "shared" / "volumes" for parent in (HERE, *HERE.parents[:5])]
 
 
@@ -47,3 +54,14 @@ def brain():
     folds = np.sin(17 * x + 3 * np.sin(6 * y)) * np.sin(17 * y + 3 * np.sin(6 * z)) * np.sin(17 * z + 3 * np.sin(6 * x))
     ball = ig.Volume(1 - radius + 0.12 * folds, (-1, -1, -1), (2 / 63,) * 3)
     return ball, (0.15, 0.45), "synthetic: a folded ball"
+
+
+def command(line):
+    """Run a line as in a terminal, in `RUNS`; returns the picture that it writes, if any, as an array."""
+    words = shlex.split(line)
+    subprocess.run([sys.executable, "-m", *words], cwd=RUNS, check=True, capture_output=True)
+    if words[-1].endswith(".png"):
+        import matplotlib.image
+
+        return matplotlib.image.imread(RUNS / words[-1])
+    return None

@@ -15,6 +15,7 @@ import warnings
 
 import matplotlib.pyplot as plt
 import numpy as np
+from gallery_fields import RUNS, command
 
 import illumgrid as ig
 from illumgrid.field.builtin import spread
@@ -56,4 +57,21 @@ for (name, sampler), top, bottom in zip(samplers.items(), *axes):
     top.set_axis_off()
     bottom.imshow(render(light, isovalue=0.47, width=420, height=380))
     bottom.set_axis_off()
+plt.show()
+
+# %%
+# The same from the command line: blobs from ten points, tints on either side, a shadow on the ceiling, which the
+# luminaire at the bottom throws upwards.
+
+points = [
+    "-.45,-.1,.1", "-.2,.25,.35", "-.05,-.3,.2", ".1,.15,-.1", ".35,-.15,.3", ".45,.2,0", ".2,-.35,-.3",
+    "-.25,-.2,-.35", "-.4,.3,-.15", ".05,0,.5",
+]  # fmt: skip
+(RUNS / "blobs.csv").write_text("\n".join(points))
+command("illumgrid density blobs.csv -o blobs.nrrd --spacing 0.05 --sigma 0.16")
+command("illumgrid run blobs.nrrd --scene box --range 4 12 --grid 40 --isovalues 6 --no-preview -o blobs")
+picture = command("illumgrid preview blobs --isovalue 7 --view 0,-12 --size 640 480 -o fig5.png")
+figure, ax = plt.subplots(figsize=(6.4, 4.8), facecolor="0.235", layout="constrained")
+ax.imshow(picture)
+ax.set_axis_off()
 plt.show()
