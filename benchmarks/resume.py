@@ -46,6 +46,7 @@ def start(folder):
     """Process id of a run."""
     if (child := os.fork()) == 0:
         os.chdir(folder)
+        signal.signal(signal.SIGHUP, signal.SIG_DFL)  # nohup ignores it
         with open(folder / "said", "w") as said:
             os.dup2(said.fileno(), 2)
             os.dup2(said.fileno(), 1)
@@ -114,9 +115,12 @@ def main():
         finished(place)
         whole = (place / "out" / "illumination.exr").read_bytes()
         shutil.rmtree(place / "out")
-        begun = time.perf_counter()
-        finished(place)
-        seconds = time.perf_counter() - begun
+        seconds = float("inf")
+        for _ in range(3):
+            begun = time.perf_counter()
+            finished(place)
+            seconds = min(seconds, time.perf_counter() - begun)
+            shutil.rmtree(place / "out")
         print(f"a run takes {seconds:.2f} s", flush=True)
         for number in range(asked.kills):
             stop = (signal.SIGKILL, signal.SIGTERM, signal.SIGHUP)[number % 3]

@@ -95,7 +95,7 @@ class Bake:
     ) -> "Bake":
         """Walk the paths with these numbers from every target as well; see `bake` for the others."""
         ranges = [range(n * paths.start, n * paths.stop) for n in self.weights]
-        going = Walk(self.targets, ranges, split(keep.known(self.targets, paths) if keep else None, self.targets))
+        going = Walk(self.targets, ranges, split(keep.known(paths) if keep else None, self.targets))
         first = np.cumsum([0, *map(len, self.targets)])
         total, within = int(first[-1]), 0
         what = "more light" if self.answers else "light"
@@ -379,7 +379,7 @@ def bake(
     for numbers in paths:
         state = state.walk(tracer, numbers, map, progress, keep, ranks)
     if keep is not None and state.answers:
-        keep.end(state.samples)
+        keep.end(state.answers)
     clock.append(time.perf_counter())
 
     grids, answers, walked = [], list(state.answers), state.paths

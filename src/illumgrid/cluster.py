@@ -96,7 +96,7 @@ class ClusterMap:
         return self.client.submit(_work, shared, piece, self.expected, pure=False)
 
     def _threads(self) -> int:
-        return sum(w["nthreads"] for w in self.client.scheduler_info(n_workers=-1)["workers"].values())
+        return int(sum(self.client.nthreads().values()))
 
 
 def _lost() -> tuple[type[BaseException], ...]:
@@ -164,5 +164,5 @@ def cluster(
         for where, about in found.items():
             if expected and (other := _other(about, expected)):
                 raise BadInput(f"the worker {where} has {other}; {_REMEDY}")
-        threads = sum(w["nthreads"] for w in client.scheduler_info(n_workers=-1)["workers"].values())
+        threads = sum(client.nthreads().values())
         yield ClusterMap(client, expected), f"{len(found)} workers with {threads} threads at {address}"

@@ -20,7 +20,7 @@ from illumgrid.io import disk, partial, store
 from illumgrid.light import Illumination
 from illumgrid.transport.samples import Queries, Samples, combine, join_queries
 from illumgrid.transport.stages import fill_nodes
-from illumgrid.transport.walk import in_order, split
+from illumgrid.transport.walk import Answer, in_order, split
 
 REACH = 3.5
 """Nodes to which a node gives its light: half the diagonal between nodes of the coarsest pass, and a little."""
@@ -60,7 +60,8 @@ def load(place: Path) -> tuple[Illumination, float]:
         if len(order) != kept.attributes["rows"]:
             raise BadInput(f"it is of {kept.attributes['rows']} points, not of {len(order)}")
         samples, share = _samples(targets, order, kept.ranges)
-        answers = split(samples, targets)
+        whole = Answer(samples.light, samples.spread, samples.paths, samples.channels, 0.0)
+        answers = [answer for answer in split(whole, targets) if answer is not None]
         grids = []
         for number, (field, spec) in enumerate(zip(scene.fields, specs)):
             known = of_field(scene, answers, number)

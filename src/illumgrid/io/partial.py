@@ -28,7 +28,7 @@ from illumgrid.field.scene import Scene
 from illumgrid.grid import Channels
 from illumgrid.io import disk
 from illumgrid.io.store import MOMENTS
-from illumgrid.transport.samples import Queries, Samples, join_queries
+from illumgrid.transport.samples import Queries, Samples
 from illumgrid.transport.walk import Answer
 
 Record = dict[str, Any]
@@ -126,7 +126,7 @@ class Partial:
         self.place = beside(folder)
         self.about, self.command, self.write_scene = about, command, scene
         self.chosen: Record | None = None  # by the run that is gone on with: grid, bounces, walked...
-        self.moments: Samples | None = None
+        self.moments: Answer | None = None
         self._before: dict[str, NDArray[Any]] = {}
         self._group: Any = None
         self._lock: int | None = None
@@ -205,15 +205,16 @@ class Partial:
             raise BadInput(f"{self.place} is of other points than the sampler asks about now; remove it to begin anew")
         self._asked, self._last = found.hexdigest(), time.monotonic()
 
-    def known(self, targets: Sequence[Queries], paths: range) -> Samples | None:
+    def known(self, paths: range) -> Answer | None:
         """See `Keeper`."""
         self._walked.append(paths)
-        self._stored, name, queries = 0, _name(paths), join_queries(targets)
+        self._stored, name = 0, _name(paths)
         if self._before and name == f"0-{self._before['walked']}":
             light, spread, count = (self._before[key] for key in ("light", "spread", "paths"))
             channels = _channels(json.loads(str(self._before["about"]))["channels"])
-            self._new.append((paths, self._place, Answer(light, spread, count, channels, 0.0)))
-            return Samples(queries, light, spread, count, channels)
+            before = Answer(light, spread, count, channels, 0.0)
+            self._new.append((paths, self._place, before))
+            return before
         if self._group is None or name not in _ranges(self._group):
             return None
         with disk.sentences(f"{self.place} cannot be gone on with", "remove it to begin anew"):
@@ -221,7 +222,7 @@ class Partial:
             light, spread, count = (part[key][:][self._place] for key in ("light", "spread", "paths"))
             self._stored = int((count >= 0).sum())
             self._tell()
-            return Samples(queries, light, spread, count, _channels(part.attrs["channels"]))
+            return Answer(light, spread, count, _channels(part.attrs["channels"]), 0.0)
 
     def keep(self, rows: NDArray[np.int64], answer: Answer) -> None:
         """See `Keeper`."""
@@ -234,9 +235,12 @@ class Partial:
         if self._group is not None:
             self._write()
 
-    def end(self, samples: Samples) -> None:
+    def end(self, answers: Sequence[Samples]) -> None:
         """See `Keeper`."""
-        self.moments = samples
+        light, spread, paths = (
+            np.concatenate([getattr(a, key) for a in answers]) for key in ("light", "spread", "paths")
+        )
+        self.moments = Answer(light, spread, paths, answers[0].channels, 0.0)
         self._before = {}
 
     def standing(self) -> str:
@@ -322,15 +326,15 @@ class Partial:
 
     def leave(self, finished: Path) -> None:
         """Give the finished run its moments, and remove the partial one."""
-        samples = self.moments
-        if samples is not None:
+        found = self.moments
+        if found is not None:
             walked = self._walked[-1].stop
-            channels = {"names": samples.channels.names, "mix": samples.channels.mix}
+            channels = {"names": found.channels.names, "mix": found.channels.mix}
             about = {"identity": self.about, "chosen": self.chosen, "queries": self._asked, "channels": channels}
             with disk.fresh_file(finished / MOMENTS) as file:
                 np.savez_compressed(
                     file, about=np.array(json.dumps(about)), walked=np.array(walked),
-                    light=samples.light, spread=samples.spread, paths=samples.paths,
+                    light=found.light, spread=found.spread, paths=found.paths,
                 )  # fmt: skip
         self.remove()
 

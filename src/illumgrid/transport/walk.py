@@ -4,7 +4,7 @@ import time
 from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,7 +33,7 @@ class Keeper(Protocol):
     def begin(self, targets: Sequence[Queries], order: NDArray[np.int64]) -> None:
         """Learn what is asked, and the rows in the order in which their answers will come."""
 
-    def known(self, targets: Sequence[Queries], paths: range) -> Samples | None:
+    def known(self, paths: range) -> "Answer | None":
         """Answers of all rows, with paths -1 where none is known; None without any."""
 
     def keep(self, rows: NDArray[np.int64], answer: "Answer") -> None:
@@ -42,7 +42,7 @@ class Keeper(Protocol):
     def flush(self) -> None:
         """Bring to the disk what was taken, if that is worth it."""
 
-    def end(self, samples: Samples) -> None:
+    def end(self, answers: Sequence[Samples]) -> None:
         """Take the moments of all paths of all rows, in the end."""
 
 
@@ -121,8 +121,8 @@ def in_order(ranks: Ranks) -> NDArray[np.int64]:
     return np.argsort(np.concatenate(ranks), kind="stable")
 
 
-def split(whole: Samples | None, targets: Sequence[Queries]) -> list[Any]:
-    """Answers to each batch, from those to all."""
+def split(whole: Answer | None, targets: Sequence[Queries]) -> list[Samples | None]:
+    """Answers to each batch, from those of all rows."""
     if whole is None:
         return [None] * len(targets)
     ends = np.cumsum([0, *map(len, targets)]).tolist()
