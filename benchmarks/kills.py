@@ -77,10 +77,9 @@ def bytes_of(path):
 
 
 def _export(ending, *more):
-    return Command(("export", "light", f"a.{ending}", *more), f"a.{ending}")
+    return Command(("export", "light", f"a.{ending}", *more), f"a.{ending}", old="4", new="6")
 
 
-SURFACE = ("--isovalue", "0.{}")
 COMMANDS = {
     "run": Command((*RUN, "--seed", "{}", "--overwrite"), "out", same=one_light),
     "preview": Command(
@@ -240,10 +239,10 @@ def main():
                 known[at] = learn(work, at, command, "new")
             if finished and known[at].old is None:
                 known[at].old = learn(work, at, command, "old").new
-            signals = SIGNALS[(number + turn) % len(SIGNALS)]
+            signals = SIGNALS[number % len(SIGNALS)]
             folder = place(work, str(number))
             try:
-                late = bool(command.writes) and turn // 2 % 2 == 1
+                late = bool(command.writes) and number // 2 % 2 == 1
                 found, took = stop(folder, command, known[at], finished, late, signals, chance)
                 slowest = max(slowest, took)
             except (AssertionError, OSError, ValueError) as trouble:
