@@ -33,8 +33,10 @@ def place_of(folder: str | os.PathLike[str]) -> Path | None:
     own = Path(folder)
     if partial.is_partial(own):
         return own
+    if os.path.exists(own):  # also of "" and "/", which have no name
+        return None
     near = partial.beside(own)
-    return near if not own.exists() and partial.is_partial(near) else None
+    return near if partial.is_partial(near) else None
 
 
 def load(place: Path) -> tuple[Illumination, float]:
