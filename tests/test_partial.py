@@ -240,3 +240,18 @@ def test_nodes_far_from_all_that_is_finished_are_striped():
     far = np.linalg.norm(np.stack(np.indices(spec.shape)), axis=0) > unfinished.REACH
     np.testing.assert_array_equal(marked.support == 0, far)
     assert set(np.unique(marked.light[far])) == {0.0, 1.5} and (marked.light[~far] == 1).all()
+
+
+@pytest.mark.parametrize("order", ["C", "F"])
+def test_a_digest_is_of_every_voxel_and_number(order):
+    volume = ball(6)
+    scene = ig.Scene.floor(volume, range=(0.3, 0.9))
+    one = partial.digest(scene)
+    values = np.array(volume.values, order=order)
+    again = ig.Volume(values.copy(order=order), volume.origin, volume.spacing)
+    before = partial.digest(again)
+    values[5, 0, 3] = np.nextafter(values[5, 0, 3], np.float32(9))
+    assert partial.digest(ig.Volume(values, volume.origin, volume.spacing)) != before
+    assert partial.digest(ig.Volume(again.values, volume.origin, volume.spacing)) == before
+    assert partial.digest(ig.Scene.floor(volume, range=(0.3, 0.9))) == one
+    assert partial.digest(ig.Scene.floor(volume, range=(0.3, 0.91))) != one

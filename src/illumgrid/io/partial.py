@@ -12,6 +12,7 @@ A finished run keeps its moments in ``moments.npz``: more paths go on from there
 import hashlib
 import json
 import os
+import pickle
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, is_dataclass
@@ -57,8 +58,9 @@ def _hash(thing: Any, update: Callable[[Any], None]) -> None:
             update(f.name.encode())
             _hash(getattr(thing, f.name), update)
     elif isinstance(thing, np.ndarray):
-        update(f"{thing.dtype.str}{thing.shape}".encode())
-        for slab in thing if thing.ndim > 1 else (thing,):
+        axes = np.argsort([-abs(step) for step in thing.strides], kind="stable")  # as it lies in memory, or in its file
+        update(f"{thing.dtype.str}{thing.shape}{axes}".encode())
+        for slab in thing.transpose(axes) if thing.ndim > 1 else (thing,):
             update(np.ascontiguousarray(slab).view(np.uint8).data)
     elif isinstance(thing, list | tuple):
         update(f"{len(thing)}[".encode())
@@ -67,7 +69,7 @@ def _hash(thing: Any, update: Callable[[Any], None]) -> None:
     elif thing is None or isinstance(thing, str | int | float | np.generic):
         update(f"{type(thing).__name__} {thing!r}".encode())
     else:
-        raise TypeError(f"{type(thing).__name__} has no digest")
+        update(pickle.dumps(thing))
 
 
 def identity(scene: Scene, stages: Mapping[str, Any], **asked: float | None) -> Record:
