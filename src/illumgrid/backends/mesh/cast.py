@@ -75,7 +75,7 @@ def in_mesh(scene, f, level, x, n):
 def settle_along(scene, own, x, n):
     """Move the frame point x along n onto mesh `own`: (position, face).
 
-    Against n there must be a front, or along it a back: the nearer one within a cell, no cap. So nothing lies between.
+    Accept the nearest front face along -n or back face along +n within one cell, excluding caps: nothing lies between.
     """
     pace = max(
         abs(n[0]) / scene.spacing[own, 0], abs(n[1]) / scene.spacing[own, 1], abs(n[2]) / scene.spacing[own, 2]
