@@ -6,17 +6,22 @@ import pickle
 import numpy as np
 import pytest
 
+import illumgrid as ig
 import naive
 from illumgrid.backends.numba_ import Numba
 from illumgrid.backends.reference import Reference
+from illumgrid.bake import MOST_BIAS, enough_bounces, light_known_first
 from illumgrid.errors import BadInput
-from illumgrid.field.scene import Scene
-from illumgrid.field.volume import Volume
+from illumgrid.field.lattice import specs_over
+from illumgrid.field.scene import Scene, level_table
+from illumgrid.field.volume import Volume, smooth
 from illumgrid.grid import GridSpec, IlluminationGrid, WallTexture, channels_of
 from illumgrid.grid.cache import NO_CACHE, cache_of
+from illumgrid.stages import on_level_sets
 from illumgrid.transport.samples import Queries, join_queries
 from illumgrid.transport.tracer import ending_in, prepare
 from rooms import ROOMS, on_quads
+from shapes import ball
 from transport import colored, everywhere, furnace, noise, on_sets, rotation, waves
 
 SAME = 1e-6  # of π, as in the oracle chain
@@ -158,3 +163,50 @@ def test_a_cache_of_another_scene_or_for_a_backend_that_knows_none_is_refused():
         cache_of(scene, grey, [])
     with pytest.raises(BadInput, match="expected the backend numba, embree or reference"):
         ending_in(cache_of(scene, grids, []), object())
+
+
+def gaussians(n=20):
+    x = np.stack(np.meshgrid(*[np.linspace(-1, 1, n)] * 3, indexing="ij"), -1)
+    middles = np.random.default_rng(2).uniform(-0.55, 0.55, (7, 3))
+    return Volume(sum(np.exp(-((x - middle) ** 2).sum(-1) / 0.08) for middle in middles))
+
+
+def shell(n=24):
+    """A cavity that is sealed at most levels, and opens at some."""
+    x = np.stack(np.meshgrid(*[np.linspace(-1, 1, n)] * 3, indexing="ij"), -1)
+    dent = 0.15 * np.exp(-((x - [0.6, 0, 0]) ** 2).sum(-1) / 0.02)
+    return Volume(np.exp(-(((np.linalg.norm(x, axis=-1) - 0.6) / 0.12) ** 2)) - dent)
+
+
+KNOWN = {
+    "gaussians": lambda: Scene.sky(gaussians()),
+    "a box with its lamp": lambda: Scene.box(gaussians()),
+    "a sealed cavity": lambda: Scene.sky(shell(), range=(0.3, 0.9)),
+    "noise": lambda: Scene.sky(smooth(noise(256, (20, 20, 20)), 1.0), range=(105, 150)),
+}
+
+
+@pytest.mark.parametrize("name", KNOWN)
+def test_the_light_of_paths_that_end_is_off_by_less_than_the_bound_in_the_mean(name):
+    scene = KNOWN[name]()
+    tracer, levels = prepare(Numba(), scene), level_table(scene, 16)
+    bounces, _ = enough_bounces(scene, tracer)
+    gathering = light_known_first(scene, specs_over(scene), levels, tracer, bounces=bounces, seed=1)
+    rows = scene.levels((np.arange(7) + 0.37) / 7)  # none of those of the walls
+    asked = join_queries(list(on_level_sets(scene, rows, 3, points=90)))
+    truth, found = (t.solve(asked, paths=range(128), bounces=3 * bounces, seed=5) for t in (tracer, gathering))
+    off = (found.mean - truth.mean)[truth.paths > 0].mean(axis=1, dtype=float) / truth.mean[truth.paths > 0].mean()
+    assert off.std() / math.sqrt(len(off)) < MOST_BIAS / 3  # the same random numbers: most noise is common to both
+    assert abs(off.mean()) < MOST_BIAS
+    assert off.any()  # some paths did end
+
+
+def test_a_run_lights_a_coarse_grid_first_where_light_needs_many_bounces():
+    options = {"grid": 6, "paths": 2, "isovalues": 2, "judge": False}
+    room = Scene.box(ball(8))
+    one, other = (ig.run(room, backend=Numba(threads=threads), **options) for threads in (1, 3))
+    assert one.recipe["bounces"] > 4
+    assert one.recipe["cache"] and "cache" in one.recipe["seconds"]
+    np.testing.assert_array_equal(one.grids[0].values, other.grids[0].values)
+    for scene, bounces in ((room, one.recipe["bounces"]), (Scene.sky(ball(8)), None)):
+        assert not ig.run(scene, bounces=bounces, **options).recipe["cache"]

@@ -15,7 +15,7 @@ from illumgrid.accuracy.choose import JUDGED, Plan, planned
 from illumgrid.accuracy.judge import judge as measure_error
 from illumgrid.accuracy.judge import judge_walls as measure_walls
 from illumgrid.accuracy.probe import FEWEST_PATHS, MOST_PATHS
-from illumgrid.bake import Baked, Map, Progress, bake, enough_bounces, light_left_out
+from illumgrid.bake import Baked, Map, Progress, bake, enough_bounces, light_known_first, light_left_out
 from illumgrid.constants import PATHS
 from illumgrid.errors import BadInput, tell, tell_after
 from illumgrid.field.lattice import specs_over
@@ -27,6 +27,9 @@ from illumgrid.light import Illumination
 from illumgrid.stages import Backend, Interpolator, Sampler
 from illumgrid.transport.stages import capabilities
 from illumgrid.transport.tracer import Tracer, prepare
+
+MANY_BOUNCES = 4
+"""More reflections than these, and a coarse grid pays that is lit first: paths are long, and most of them end there."""
 
 
 def load(folder: str | os.PathLike[str]) -> Illumination:
@@ -76,7 +79,8 @@ def run(
         Light paths from every query; by default 32.
     bounces : int, optional
         Reflections; 0 is light straight from background and lamps. By default as many as leave out less than 1 % of
-        the light, and at least 4.
+        the light, and at least 4; where it takes more, a coarse grid is lit first, and paths end in its light where
+        that is known well: see `illumgrid.bake.light_known_first`. A number given here is followed path by path.
     isovalues : int, optional
         Rows of the level table, 32 by default; if given, also the count of a sampler that is named and has one.
     seed : int
@@ -122,6 +126,7 @@ def run(
     left_out, before = 0.0, None if keep is None else keep.chosen
     if error is not None or seconds is not None:
         _check_plannable(error, seconds, *chosen)
+    cached = bool(before and before.get("cache"))
     if before:
         grid, bounces, left_out, plan = (before[key] for key in ("grid", "bounces", "left_out", "plan"))
         walked = _gone_on_with(before, None if error or seconds else paths or PATHS)
@@ -141,14 +146,23 @@ def run(
     needs.check_run(scene, specs, levels, getattr(chosen[2], "density", 1.0))
     if bounces is None:
         bounces, left_out = enough_bounces(scene, tracer, seed)
+        cached = bounces > MANY_BOUNCES and capabilities(chosen[1]).surface == "levelset" and hasattr(tracer, "cache")
     elif not before:
         left_out = light_left_out(scene, tracer, bounces, seed)
+    clock, gathering = time.perf_counter(), tracer
+    if cached:
+        gathering = light_known_first(
+            scene, specs, levels, tracer, bounces=bounces, seed=seed, map=map,
+            progress=lambda what, done, total: progress("first light", done, total),
+        )  # fmt: skip
+        left_out = left_out if before else light_left_out(scene, gathering, bounces, seed)
+    first = {"cache": time.perf_counter() - clock} if cached else {}
     if keep is not None:
         fixed = None if isinstance(walked, Iterator) else max(r.stop for r in walked)
-        about = {"grid": grid, "bounces": bounces, "left_out": left_out, "paths": fixed}
+        about = {"cache": cached, "grid": grid, "bounces": bounces, "left_out": left_out, "paths": fixed}
         keep.choose({**about, "plan": asdict(plan) if isinstance(plan, Plan) else plan})
     baked = bake(
-        scene, specs, levels, chosen[0], tracer, chosen[2],
+        scene, specs, levels, chosen[0], gathering, chosen[2],
         paths=walked, bounces=bounces, seed=seed, map=map, progress=progress, keep=keep,
     )  # fmt: skip
     _note_holes(scene, baked)
@@ -157,9 +171,10 @@ def run(
         "grid": max(max(spec.shape) for spec in specs),
         "bounces": bounces,
         "left_out": left_out,
+        "cache": cached,
         "isovalues": len(levels.table),
         "seed": seed,
-        **_measured(baked),
+        **_measured(baked, first),
         "plan": asdict(plan) if isinstance(plan, Plan) else plan,
         "reached": None,
         "reached_uncertain": None,
@@ -205,15 +220,15 @@ def _note_holes(scene: Scene, baked: Baked) -> None:
             )
 
 
-def _measured(baked: Baked) -> dict[str, Any]:
-    """What the recipe says about how the light came about."""
+def _measured(baked: Baked, first: dict[str, float]) -> dict[str, Any]:
+    """What the recipe says about how the light came about; `first` is the time of what came before the bake."""
     return {
         "paths": baked.paths,
         "queries": baked.queries,
         "texels": baked.texels,
         "texel_paths": baked.texel_paths,
         "holes": list(baked.holes),
-        "seconds": {stage: round(seconds, 3) for stage, seconds in baked.seconds.items()},
+        "seconds": {stage: round(seconds, 3) for stage, seconds in {**first, **baked.seconds}.items()},
         "relative_error": [grid.relative_error for grid in baked.grids],
     }
 

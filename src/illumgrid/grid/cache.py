@@ -17,7 +17,7 @@ from illumgrid.grid.channels import channels_of
 from illumgrid.grid.illumination import IlluminationGrid
 from illumgrid.grid.walls import WallTexture
 
-ALIKE = 0.5
+ALIKE = 0.3
 """Spread of a cell's nodes, largest less smallest, over the mean light of the grid, above which paths go on."""
 
 
