@@ -14,7 +14,7 @@ import numpy as np
 
 from illumgrid.field.lights import Distant, Sky
 from illumgrid.field.upright import sky_axes
-from illumgrid.rng import draw, draw_pair, net_size, sharing, stream
+from illumgrid.rng import draw, draw_pair, mix, net_size, sharing, stream
 
 WALL = 1e-10
 """A wall reaches this share of its size farther than its corners say."""
@@ -50,10 +50,10 @@ class Hit:
 class Solid:
     """The solid {v >= level} of one field in the box of its voxel centres; v is h, or -h where `inside` is "below"."""
 
-    def __init__(self, scene, levels, number):
+    def __init__(self, scene, levels, number, turned=False):
         field = scene.fields[number]
         self.number = number
-        self.sign = 1.0 if field.inside == "above" else -1.0
+        self.sign = 1.0 if (field.inside == "above") != turned else -1.0
         self.level = self.sign * float(levels[number])
         self.values = field.volume.values
         self.origin = [float(c) for c in scene.to_frame(field.volume.origin)]
@@ -328,7 +328,7 @@ def lamp_density(scene, number, distance, d):
     return 0.0
 
 
-def ask_a_lamp(scene, levels, hit, u, v, choice):
+def ask_a_lamp(scene, levels, hit, u, v, choice, within=frozenset()):
     """Radiance (3,) from one point of one lamp, weighted by the balance heuristic, per cosine-distributed path."""
     total = 0.0
     for wall, chance in lamps(scene):  # noqa: B007
@@ -345,15 +345,64 @@ def ask_a_lamp(scene, levels, hit, u, v, choice):
     by_lamp = lamp_density(scene, wall.number, distance, d)
     if by_cosine <= 0 or by_lamp <= 0:
         return np.zeros(3)
-    met = first_hit(scene, levels, hit.x, d, on=hit)
+    met, share = dimmed(scene, levels, hit, d, within)
     seen = met is not None and met.field == wall.number
-    return wall.emission * by_cosine / (by_cosine + by_lamp) if seen else np.zeros(3)
+    return share * wall.emission * by_cosine / (by_cosine + by_lamp) if seen else np.zeros(3)
+
+
+def dimmed(scene, levels, hit, d, within):
+    """What a ray from a hit meets behind all films, and the share of light that they let through."""
+    shares = [1.0]
+    met = behind_films(scene, levels, d, hit, set(within), lambda film, share: shares.append(share) or True)
+    return met, math.prod(shares)
 
 
 # Light.
 
 
-def first_hit(scene, levels, x, d, on=None):
+def films(scene, levels, hit):
+    """Numbers of the fields that transmit and within whose shells a hit on another surface lies."""
+    return {
+        k
+        for k, field in enumerate(scene.fields)
+        if k != hit.field and field.material.transmission > 0 and Solid(scene, levels, k).holds(hit.x)
+    }
+
+
+def leave(scene, levels, number, x, d, on):
+    """Hit of a ray within the shell of a field: its inner side, or the border of the volume."""
+    outside = Solid(scene, levels, number, turned=True)
+    own = on is not None and on.field == number and not on.cap
+    hit = meet_own(outside, x, d, on) if own else meet_other(outside, x, d)
+    if hit is not None:
+        return hit
+    u, du = outside.index(x), [d[a] / outside.spacing[a] for a in range(3)]
+    ends = [((outside.last[a] if du[a] > 0 else 0) - u[a]) / du[a] if du[a] else math.inf for a in range(3)]
+    t, axis, normal = max(min(ends), 0.0), ends.index(min(ends)), [0.0, 0.0, 0.0]
+    normal[axis] = -math.copysign(1.0, d[axis])
+    return Hit(t, number, [x[a] + t * d[a] for a in range(3)], normal, cap=True)
+
+
+def behind_films(scene, levels, d, on, within, passes):
+    """First hit of a ray along d after the films that it passes: number k, of this share, where passes(k, share).
+
+    `within`, the shells that the ray is in, changes with them.
+    """
+    length, start = 0.0, on
+    for k in range(64):
+        hit = first_hit(scene, levels, start.x, d, on=start, within=within)
+        if hit is None:
+            return None
+        length += hit.t
+        share = scene.fields[hit.field].material.transmission if hit.field < len(scene.fields) else 0.0
+        if share == 0 or not passes(k, share):
+            break
+        within ^= {hit.field}
+        start = hit
+    return Hit(length, hit.field, hit.x, hit.normal, hit.cap)
+
+
+def first_hit(scene, levels, x, d, on=None, within=frozenset()):
     """First hit of a ray.
 
     Parameters
@@ -365,6 +414,8 @@ def first_hit(scene, levels, x, d, on=None):
         Start and unit direction in the frame.
     on : Hit, optional
         The surface on which the ray starts.
+    within : set of int
+        Fields within whose shells the ray starts.
 
     Returns
     -------
@@ -376,7 +427,9 @@ def first_hit(scene, levels, x, d, on=None):
     hits = [wall.meet(x, d) for wall in walls if on is None or on.field != wall.number]
     for number in range(len(scene.fields)):
         solid = Solid(scene, levels, number)
-        if on is None or on.field != number:
+        if number in within:
+            hits.append(leave(scene, levels, number, x, d, on))
+        elif on is None or on.field != number:
             hits.append(meet_other(solid, x, d))
         elif not on.cap:  # a ray from a cap leaves the convex box
             hits.append(meet_own(solid, x, d, on))
@@ -406,7 +459,7 @@ def on_query(scene, query):
 def is_hole(scene, query):
     """Whether the one query in `query` has no normal or lies in the solid of another field."""
     at = on_query(scene, query)
-    others = (k for k in range(len(scene.fields)) if k != at.field)
+    others = (k for k, f in enumerate(scene.fields) if k != at.field and f.material.transmission == 0)
     return not any(at.normal) or any(Solid(scene, query.level[0], k).holds(at.x) for k in others)
 
 
@@ -420,13 +473,19 @@ def path_worth(scene, query, path, bounces, seed, known=None):
         u = [[float(c) for c in draw_pair(key, np.uint64(path), np.uint64(k))] for k in range(bounces + 1)]
         choices = [float(draw(key, np.uint64(path), np.uint64(k))) for k in range(bounces + 1)]
     hit, worth, throughput = on_query(scene, query), np.zeros(3), np.ones(3)
+    within = films(scene, query.level[0], hit)
     for k in range(bounces + 1):
+
+        def by_chance(film, share, k=k):
+            with np.errstate(over="ignore"):
+                return float(draw(mix(key + np.uint64(film + 1)), np.uint64(path), np.uint64(k))) < share
+
         if choices[k] < lamp_chance(scene):
-            worth = worth + throughput * ask_a_lamp(scene, query.level[0], hit, *u[k], choices[k])
+            worth = worth + throughput * ask_a_lamp(scene, query.level[0], hit, *u[k], choices[k], within)
         elif distant(scene):
-            worth = worth + throughput * ask_the_sky(scene, query.level[0], hit, *u[k], choices[k])
+            worth = worth + throughput * ask_the_sky(scene, query.level[0], hit, *u[k], choices[k], within)
         d = cosine_direction(hit.normal, u[k][0], u[k][1])
-        start, hit = hit, first_hit(scene, query.level[0], hit.x, d, on=hit)
+        start, hit = hit, behind_films(scene, query.level[0], d, hit, within, by_chance)
         if hit is None:
             p = sum(a * b for a, b in zip(start.normal, d)) / math.pi
             asked = radiance_of_discs(scene, d) * p / (p + sky_density(scene, d))
@@ -436,7 +495,12 @@ def path_worth(scene, query, path, bounces, seed, known=None):
         emission, albedo = surface(scene, hit, start, d)
         worth = worth + throughput * emission
         throughput = throughput * albedo
-        if known and k < bounces and (light := cached(scene, query.level[0], hit, start, d, *known)) is not None:
+        if (
+            known
+            and hit.field not in within
+            and k < bounces
+            and (light := cached(scene, query.level[0], hit, start, d, *known)) is not None
+        ):
             return worth + throughput * light / math.pi
     return worth
 
@@ -518,7 +582,7 @@ def smooth_sky(scene, d):
     return total
 
 
-def ask_the_sky(scene, levels, hit, u1, u2, choice):
+def ask_the_sky(scene, levels, hit, u1, u2, choice, within=frozenset()):
     """Light (3,) from one direction within one disc, if nothing is in the way, weighted against the cosine."""
     first, count = lamp_chance(scene), len(distant(scene))
     disc = distant(scene)[min(count - 1, int((choice - first) * count / (1 - first)))]
@@ -526,16 +590,18 @@ def ask_the_sky(scene, levels, hit, u1, u2, choice):
     # The frame is that of a cosine-distributed direction, whose own cosine is sqrt(1 - u).
     d = cosine_direction(scene.fields[0].volume.direction.T @ disc.direction, 1 - cosine * cosine, u2)
     p = sum(a * b for a, b in zip(hit.normal, d)) / math.pi
-    if p <= 0 or first_hit(scene, levels, hit.x, d, on=hit) is not None:
+    if p <= 0:
         return np.zeros(3)
-    return radiance_of_discs(scene, d) * p / (p + sky_density(scene, d))
+    met, share = dimmed(scene, levels, hit, d, within)
+    return share * radiance_of_discs(scene, d) * p / (p + sky_density(scene, d)) if met is None else np.zeros(3)
 
 
 def surface(scene, hit, start, d):
     """Emission towards the ray that came from `start` along d, weighted against `ask_a_lamp`, and albedo of a hit."""
     if hit.field < len(scene.fields):
         material = scene.fields[hit.field].material
-        return material.emission, material.albedo
+        reflected = max(1 - material.transmission, 1e-300)  # of what is not sent straight on
+        return material.emission, material.albedo / reflected
     quad = scene.quads[hit.field - len(scene.fields)]
     if sum(a * b for a, b in zip(Wall(scene, hit.field - len(scene.fields)).normal, d)) >= 0:
         return np.zeros(3), quad.material.albedo  # the back

@@ -102,7 +102,7 @@ def test_the_blend_is_between_lookup_and_rays_and_its_weights_know_no_ray(on_a_f
 def test_a_lookup_without_error_is_trusted_and_one_that_is_off_is_not():
     """On the sphere under a sky that is the same from everywhere, black: E is pi."""
     right, wrong = (gathering(grey_light(value), 4).trust[0] for value in (np.pi, 1.0))
-    assert right[1] < 1e-3 and wrong[1] == pytest.approx((np.pi - 1) ** 2, rel=0.01)
+    assert right[1] < 0.02 and wrong[1] == pytest.approx((np.pi - 1) ** 2, rel=0.01)
 
 
 def test_rays_converge_to_paths_of_every_length(grey):

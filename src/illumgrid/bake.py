@@ -288,18 +288,20 @@ def _on_few_rows(scene: Scene, seed: int, rows: int = 4, count: int = 32) -> Que
     """
     specs = [GridSpec.over(field.volume, 10) for field in scene.fields]
     nodes = join_queries([q for q in Direct().queries(scene, specs, seed) if len(q)])
-    first, last = np.array([field.sweep for field in scene.fields])[nodes.target].T
-    place = (nodes.level[np.arange(len(nodes)), nodes.target] - first) / (last - first)
+    place = np.zeros(len(nodes))
+    for number, field in enumerate(scene.fields):
+        own = nodes.target == number
+        place[own] = field.place(nodes.level[own, number])
     shuffled = np.random.default_rng(seed).permutation(len(nodes))  # many stand at an end of the range
     asked = []
     for number, part in enumerate(np.array_split(shuffled[np.argsort(place[shuffled], kind="stable")], rows)):
         middle = place[part[len(part) // 2]] if len(part) else 0.0
         near = part[np.argsort(np.abs(place[part] - middle), kind="stable")[:count]]
-        for field in np.unique(nodes.target[near]):
-            points = nodes.point[near[nodes.target[near] == field]]
-            level = scene.levels(middle)[0, field]
-            first = (number * len(scene.fields) + int(field)) * count
-            asked.append(Queries.at(scene, points, field=int(field), level=level, first_id=first))
+        for target in np.unique(nodes.target[near]):
+            points = nodes.point[near[nodes.target[near] == target]]
+            level = scene.levels(middle)[0, target]
+            first = (number * len(scene.fields) + int(target)) * count
+            asked.append(Queries.at(scene, points, field=int(target), level=level, first_id=first))
     return join_queries(asked)
 
 
@@ -372,7 +374,8 @@ def bake(
     texels = wall_queries(scene, levels)
     asked, on_walls = (sum(len(batch) for batch in batches) for batches in (nodes, texels))
     more = texel_paths(asked, on_walls)
-    state = Bake((*nodes, *texels), (1,) * len(nodes) + (more,) * len(texels), bounces, seed)
+    held, count = held_queries(scene, nodes), len(nodes)
+    state = Bake((*nodes, *held, *texels), (1,) * (count + len(held)) + (more,) * len(texels), bounces, seed)
     del nodes, texels
     clock.append(time.perf_counter())
     ranks = None if keep is None else [coarse_first(scene, specs, levels, batch) for batch in state.targets]
@@ -384,12 +387,18 @@ def bake(
         keep.end(state.answers)
     clock.append(time.perf_counter())
 
-    grids, answers, walked = [], list(state.answers), state.paths
-    del state
+    grids, walked = [], state.paths
+    rows = list(state.answers[count : count + len(held)])
+    answers = [*state.answers[:count], *state.answers[count + len(held) :]]
+    del state, held
     for number, spec in enumerate(specs):
         samples = of_field(scene, answers, number)
         answers = [a for a in answers if (a.queries.target > number).any()]  # a large run is held once, not twice
-        grids.append(fill_nodes(interpolator, samples, Nodes(spec, scene.fields[number], number)))
+        nodes_of = Nodes(spec, scene.fields[number], number)
+        grids.append(fill_nodes(interpolator, samples, nodes_of))
+        if scene.fields[number].isovalue is not None:
+            lit = tuple(fill_nodes(interpolator, rows.pop(0), nodes_of) for _ in range(HELD_ROWS))
+            grids[-1] = replace(grids[-1], values=grids[-1].light, rows=lit)
         del samples
         progress("grid", number + 1, len(specs))
     walls = [wall_texture(len(levels.table), quad, answer) for quad, answer in zip(scene.quads, answers)]
@@ -438,6 +447,29 @@ def light_known_first(
         bounces=2 * bounces, seed=shifted_seed(seed, 2**60), **how,
     )  # fmt: skip
     return ending_in(cache_of(scene, known.grids, known.walls), tracer)
+
+
+HELD_ROWS = 5
+"""Places of the sweep, its ends among them, at which a level that is held is lit."""
+
+
+def held_queries(scene: Scene, nodes: Sequence[Queries]) -> list[Queries]:
+    """Queries at the nodes of each field whose level is held, with the others at `HELD_ROWS` places of the sweep.
+
+    One batch a field and place, place after place.
+    """
+    batches = []
+    for number, field in enumerate(scene.fields):
+        if field.isovalue is None:
+            continue
+        own = [batch[batch.target == number] for batch in nodes if (batch.target == number).any()]
+        asked = join_queries(own) if own else Queries.at(scene, np.zeros((0, 3)), number)
+        for row, level in enumerate(scene.levels(np.linspace(0.0, 1.0, HELD_ROWS))):
+            levels = np.tile(level, (len(asked), 1))
+            levels[:, number] = asked.level[:, number]
+            ids = asked.id | np.uint64(row + 1) << np.uint64(56)
+            batches.append(Queries(ids, asked.point, asked.normal, levels, asked.target))
+    return batches
 
 
 def of_field(scene: Scene, answers: Sequence[Samples], number: int) -> Samples:

@@ -38,3 +38,6 @@ SAME_ROW = 1e-6
 
 OFF_SWEEP = -1.0
 """In place of a row's place in the sweep: the levels belong to no row."""
+
+MOST_FILMS = 64
+"""Films that a ray goes straight through before it meets a surface that reflects it."""

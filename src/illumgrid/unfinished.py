@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from illumgrid import registry
-from illumgrid.bake import coarse_first, of_field, wall_queries, wall_texture
+from illumgrid.bake import coarse_first, held_queries, of_field, wall_queries, wall_texture
 from illumgrid.errors import BadInput
 from illumgrid.field.lattice import specs_over
 from illumgrid.field.scene import level_table
@@ -57,13 +57,16 @@ def load(place: Path) -> tuple[Illumination, float]:
         )
         specs = specs_over(scene, chosen["grid"])
         levels = level_table(scene, about["isovalues"] or 32)
-        targets = [q for q in sampler.queries(scene, specs, about["seed"]) if len(q)] + wall_queries(scene, levels)
+        nodes = [q for q in sampler.queries(scene, specs, about["seed"]) if len(q)]
+        held = held_queries(scene, nodes)
+        targets = nodes + held + wall_queries(scene, levels)
         order = in_order([coarse_first(scene, specs, levels, batch) for batch in targets])
         if len(order) != kept.attributes["rows"]:
             raise BadInput(f"it is of {kept.attributes['rows']} points, not of {len(order)}")
         samples, share = _samples(targets, order, kept.ranges)
         whole = Answer(samples.light, samples.spread, samples.paths, samples.channels, 0.0)
         answers = [answer for answer in split(whole, targets) if answer is not None]
+        del answers[len(nodes) : len(nodes) + len(held)]  # the middle of the sweep will do until the run has ended
         grids = []
         for number, (field, spec) in enumerate(zip(scene.fields, specs)):
             known = of_field(scene, answers, number)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from illumgrid.backends.lights_numpy import Ints
 from illumgrid.backends.mesh.bvh import unit_cube
-from illumgrid.backends.mesh.meshes import LevelMesh, Meshes, meshed, row_groups
+from illumgrid.backends.mesh.meshes import LevelMesh, Meshes, check_opaque, meshed, row_groups
 from illumgrid.backends.numba_ import pool, share
 from illumgrid.backends.reference import (
     Bools,
@@ -94,7 +94,7 @@ class Casting:
     def begin(self, own: Ints, x: Floats, normal: Floats) -> tuple[Floats, Ints]:
         """Along the normal onto the mesh, or along that of the cell: see `mesh.cast.settle`."""
         x, face = x.copy(), np.full(len(x), NOWHERE)
-        for f in range(len(self.scene.start)):
+        for f in range(len(self.scene.twin)):
             mine = np.flatnonzero(own == f)
             face[mine] = LOST
             for along in (normal[mine], cell_normal(self.scene, f, x[mine])):
@@ -195,6 +195,7 @@ class Embree:
 
     def prepare(self, scene: Scene) -> "EmbreeTracer":
         """Lay the fields out; meshes are built when they are asked for."""
+        check_opaque(scene)
         return EmbreeTracer(self, scene, *laid_out(scene), Meshes(scene, grow), pool(self.threads))
 
     solve = solve_once

@@ -68,7 +68,7 @@ def ends_in_cache(scene, cache, place, number, what, t, x, d, throughput, worth)
         )  # fmt: skip
     if what != QUAD:
         return False
-    quad = number - scene.start.shape[0]
+    quad = number - scene.twin.shape[0]
     if dot(scene.quad_normal[quad], d) >= 0.0:
         return False
     corner = scene.quad_corner[quad]

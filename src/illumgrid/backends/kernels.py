@@ -26,7 +26,7 @@ from illumgrid.backends.mesh import bvh
 from illumgrid.backends.mesh import cast as mesh_cast
 from illumgrid.backends.simd import cached
 from illumgrid.backends.surfaces import begin, inside, meet_solid, solid_normal
-from illumgrid.constants import BURIED, LOST, MISS, NOWHERE, ON_A_WALL, QUAD, UNSEEN
+from illumgrid.constants import BURIED, CAP, LOST, MISS, MOST_FILMS, NOWHERE, ON_A_WALL, QUAD, SURFACE, UNSEEN
 from illumgrid.rng import draw, draw_pair, mix, net_size, pascal, reverse, sharing, stream, upward
 
 for _function in (mix, stream, draw, reverse, pascal, upward, draw_pair, net_size, sharing):
@@ -65,16 +65,34 @@ def meet_quad(scene, q, x, d):
     return np.inf
 
 
+@jit
+def leave_shell(scene, f, level, x, n, d, own, face, limit):
+    """First meeting of the frame ray x + t d, which starts within the shell of field f, with its inner side.
+
+    As `meet_solid`; at the border of the volume the shell is closed by caps.
+    """
+    t, what, _ = meet_solid(scene, scene.twin[f], -level, x, n, d, own and face < 0, np.int64(NOWHERE), limit)
+    if what != MISS:
+        return t, SURFACE, NOWHERE
+    t, axis = np.inf, NOWHERE
+    for a in range(3):
+        if d[a] != 0.0:
+            end = scene.origin[f, a] + (scene.spacing[f, a] * (scene.shape[f, a] - 1) if d[a] > 0.0 else 0.0)
+            if (end - x[a]) / d[a] < t:
+                t, axis = (end - x[a]) / d[a], a
+    return (max(t, 0.0), CAP, axis) if t < limit else (np.inf, MISS, NOWHERE)
+
+
 @inlined
-def nearest_hit(scene, level, x, n, d, on, on_face):
+def nearest_hit(scene, level, x, n, d, on, on_face, within):
     """First surface along the frame ray x + t d, from surface number `on` (-1: from nowhere): (t, number, what, face).
 
-    The ray starts on a surface of normal n, 0 if on none.
+    The ray starts on a surface of normal n, 0 if on none, within the shells of the fields whose bits `within` has.
 
     `face` is the axis of a cap, or of a mesh the face; `on_face` is that of the start. Fields count from 0, quads
     follow. A quad cannot be met again; the level set itself can.
     """
-    fields = scene.start.shape[0]
+    fields = scene.twin.shape[0]
     best, number, what, face = np.inf, -1, MISS, NOWHERE
     for q in range(scene.quad_corner.shape[0]):
         if fields + q != on:
@@ -82,33 +100,71 @@ def nearest_hit(scene, level, x, n, d, on, on_face):
             if t < best:
                 best, number, what, face = t, fields + q, QUAD, NOWHERE
     for f in range(fields):
-        t, hit, at = meet_solid(scene, f, level[f], x, n, d, f == on, on_face, best)
+        if within >> f & 1:
+            t, hit, at = leave_shell(scene, f, level[f], x, n, d, f == on, on_face, best)
+        else:
+            t, hit, at = meet_solid(scene, f, level[f], x, n, d, f == on, on_face, best)
         if hit != MISS and t < best:
             best, number, what, face = t, f, hit, at
     return best, number, what, face
 
 
 @jit
+def hit_beyond(scene, level, x, n, d, on, on_face, within):
+    """`nearest_hit`, compiled once more, for all that comes behind films."""
+    return nearest_hit(scene, level, x, n, d, on, on_face, within)
+
+
+@jit
+def lets_through(scene, number, what):
+    """Share of the light that goes straight through what a ray met."""
+    if number < 0 or number >= scene.transmission.shape[0] or (what != SURFACE and what != CAP):
+        return 0.0
+    return scene.transmission[number]
+
+
+@jit
+def followed(scene, key, path, segment, level, x, n, d, on, on_face, within):
+    """As `nearest_hit`, after the films that the path goes through by chance: (t, number, what, face, within)."""
+    t, number, what, face = hit_beyond(scene, level, x, n, d, on, on_face, within)
+    for film in range(MOST_FILMS):
+        share = lets_through(scene, number, what)
+        if share == 0.0 or draw(mix(key + np.uint64(film + 1)), path, np.uint64(segment)) >= share:
+            break
+        within ^= 1 << number
+        start = (x[0] + t * d[0], x[1] + t * d[1], x[2] + t * d[2])
+        more, number, what, face = hit_beyond(scene, level, start, n, d, number, face, within)
+        t += more
+    return t, number, what, face, within
+
+
+@jit
 def hit_normal(scene, number, what, face, x, d):
     """Normal where a ray met a surface: that of the solid, or of the side of the quad it came to."""
     if what == QUAD:
-        normal = scene.quad_normal[number - scene.start.shape[0]]
+        normal = scene.quad_normal[number - scene.twin.shape[0]]
         side = -np.copysign(1.0, dot(normal, d))
         return side * normal[0], side * normal[1], side * normal[2]
     return solid_normal(scene, number, what, face, x, d)
 
 
 @jit
-def buried(scene, level, x, n, own):
-    """Whether the frame point x, on a surface of normal n, lies inside the solid of a field other than `own`."""
-    for f in range(scene.start.shape[0]):  # noqa: SIM110
+def shells_around(scene, level, x, n, own):
+    """Bits of the fields other than `own` whose shells the frame point x lies within, on a surface of normal n.
+
+    -1 if it lies inside a solid.
+    """
+    within = np.int64(0)
+    for f in range(scene.twin.shape[0]):
         if f != own and inside(scene, f, level[f], x, n):
-            return True
-    return False
+            if scene.twin[f] < 0:
+                return np.int64(-1)
+            within |= np.int64(1) << f
+    return within
 
 
 @jit
-def light_asked(scene, choice, u, v, level, on, on_face, x, n):
+def light_asked(scene, choice, u, v, level, on, on_face, x, n, within):
     """Ask one light for what arrives at x: (weight, quad, direction); the quad is -1 for distant light.
 
     The weight, of a lamp's emission or of the radiance from that direction, is that of the balance heuristic: cosine
@@ -122,34 +178,44 @@ def light_asked(scene, choice, u, v, level, on, on_face, x, n):
         if distance == 0.0:
             return 0.0, q, n
         d = (wx / distance, wy / distance, wz / distance)
-        number, by_light = scene.start.shape[0] + q, lamp_density(scene, q, distance, d)
+        number, by_light = scene.twin.shape[0] + q, lamp_density(scene, q, distance, d)
     else:
         d = distant_direction(scene, choice, u, v)
         by_light = distant_density(scene, d)
     by_cosine = dot(n, d) / np.pi
     if by_cosine <= 0.0 or by_light <= 0.0 or (q >= 0 and number == on):
         return 0.0, q, d
-    # The ray that meets this lamp first, or nothing, has met nothing else before.
-    _, met, _, _ = nearest_hit(scene, level, x, n, d, on, on_face)
-    return (by_cosine / (by_cosine + by_light) if met == number else 0.0), q, d
+    # The ray that meets this lamp first, or nothing, has met nothing else before but films, which let a share through.
+    weight, start = by_cosine / (by_cosine + by_light), x
+    t, met, what, face = nearest_hit(scene, level, x, n, d, on, on_face, within)
+    for _ in range(MOST_FILMS):
+        share = lets_through(scene, met, what)
+        if share == 0.0:
+            break
+        weight *= share
+        within ^= 1 << met
+        start = (start[0] + t * d[0], start[1] + t * d[1], start[2] + t * d[2])
+        t, met, what, face = hit_beyond(scene, level, start, n, d, met, face, within)
+    return (weight if met == number else 0.0), q, d
 
 
 @jit
-def walk(scene, cache, place, key, path, bounces, level, own, own_face, x, n, throughput, worth):
+def walk(scene, cache, place, key, path, bounces, level, own, own_face, x, n, within, throughput, worth):
     """One path from the frame point x, with normal n, on `own_face` of surface `own`: fills its `worth` (C,).
 
     The irradiance there is π times the mean over the paths. `throughput` (C,) is room for the share of the light that
-    comes back along the path. `place` is that of its levels in the sweep of the cache.
+    comes back along the path. `place` is that of its levels in the sweep of the cache; `within` has the bits of the
+    fields whose shells it starts in.
     """
     throughput[:], worth[:] = 1.0, 0.0
-    on, on_face, fields = own, own_face, scene.start.shape[0]
+    on, on_face, fields = own, own_face, scene.twin.shape[0]
     for segment in range(bounces + 1):
         # Ask a lamp or the sky for light, weighted against the chance that the ray below finds it. One pair of numbers
         # serves both: each keeps its mean, and their shared boxes keep the error bars short.
         u1, u2 = draw_pair(key, path, np.uint64(segment))
         if scene.lamps.shape[0] > 0 or scene.asked[0] < 1.0:
             choice = draw(key, path, np.uint64(segment))
-            weight, q, d = light_asked(scene, choice, u1, u2, level, on, on_face, x, n)
+            weight, q, d = light_asked(scene, choice, u1, u2, level, on, on_face, x, n, within)
             if q >= 0:
                 gather(worth, throughput, weight, scene.emission[fields + q])
             elif weight > 0.0:
@@ -158,8 +224,11 @@ def walk(scene, cache, place, key, path, bounces, level, own, own_face, x, n, th
         # Choose a direction by the cosine about the normal.
         d = cosine_direction(u1, u2, n[0], n[1], n[2])
 
-        # Follow the ray to the nearest surface; one that dips under its own has hit it already.
-        t, number, what, face = nearest_hit(scene, level, x, n, d, on, on_face)
+        # Follow the ray to the nearest surface, by chance through films; one that dips under its own hit it already.
+        if scene.transmission.shape[0] == 0:
+            t, number, what, face = nearest_hit(scene, level, x, n, d, on, on_face, within)
+        else:
+            t, number, what, face, within = followed(scene, key, path, segment, level, x, n, d, on, on_face, within)
 
         # A path that escapes sees the sky, and ends.
         if what == MISS:
@@ -189,10 +258,17 @@ def walk(scene, cache, place, key, path, bounces, level, own, own_face, x, n, th
         on, on_face = number, face
         if t > 0.0 or what == QUAD:
             x = (x[0] + t * d[0], x[1] + t * d[1], x[2] + t * d[2])
-            # End where the light is known.
-            if segment < bounces and ends_in_cache(scene, cache, place, number, what, t, x, d, throughput, worth):
+            # End where the light is known: on the outer side.
+            inner = number < fields and (within >> number) & 1 == 1
+            if (
+                cache.after <= segment < bounces
+                and not inner
+                and ends_in_cache(scene, cache, place, number, what, t, x, d, throughput, worth)
+            ):
                 break
             n = hit_normal(scene, number, what, face, x, d)
+            if inner and what == SURFACE:
+                n = (-n[0], -n[1], -n[2])
             if n[0] == 0.0 and n[1] == 0.0 and n[2] == 0.0:
                 break
 
@@ -278,13 +354,14 @@ def solve_queries(
             continue
         own = np.int64(target[i])  # one type of number throughout: each further one is compiled anew
         x, face = begin(scene, own, x, n)
-        if face == LOST or buried(scene, level[i], x, n, own):
+        within = shells_around(scene, level[i], x, n, own)
+        if face == LOST or within < 0:
             continue
         key, place = stream(seed, ids[i]), place_in_sweep(cache, level[i])
         for k in range(count):
             if stop[0] != 0:
                 return
-            at = (level[i], own, face, x, n)
+            at = (level[i], own, face, x, n, within)
             walk(scene, cache, place, key, np.uint64(first + k), bounces, *at, throughput, worth[k])
         for channel in range(worth.shape[1]):
             mean_worth, off = moments(worth, first, scene.usual[channel], scene.lamplight[channel], channel)
@@ -298,17 +375,17 @@ def cast_rays(scene, level, origin, direction, on, t, number, what, normal):
 
     Rays from nowhere (`on` is -1) are those of a camera: they see the fronts of quads only.
     """
-    fields, none, nowhere = scene.start.shape[0], (0.0, 0.0, 0.0), np.int64(NOWHERE)
+    fields, none, nowhere, outside = scene.twin.shape[0], (0.0, 0.0, 0.0), np.int64(NOWHERE), np.int64(0)
     for i in range(origin.shape[0]):
         x, d = (origin[i, 0], origin[i, 1], origin[i, 2]), (direction[i, 0], direction[i, 1], direction[i, 2])
         through, start, passed = on, x, 0.0
-        t[i], number[i], what[i], face = nearest_hit(scene, level, x, none, d, on, nowhere)
+        t[i], number[i], what[i], face = nearest_hit(scene, level, x, none, d, on, nowhere, outside)
         while on < 0 and what[i] == QUAD and dot(scene.quad_normal[number[i] - fields], d) >= 0.0:
             # A wall seen from behind is not there: go on from it.
             passed += t[i]
             through = number[i]
             start = (x[0] + passed * d[0], x[1] + passed * d[1], x[2] + passed * d[2])
-            t[i], number[i], what[i], face = nearest_hit(scene, level, start, none, d, through, nowhere)
+            t[i], number[i], what[i], face = nearest_hit(scene, level, start, none, d, through, nowhere, outside)
         t[i] += passed
         if what[i] != MISS and what[i] != BURIED:
             hit = (x[0] + t[i] * d[0], x[1] + t[i] * d[1], x[2] + t[i] * d[2])

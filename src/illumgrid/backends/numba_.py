@@ -62,8 +62,9 @@ class Numba:
         meshes = None
         if self.surface == "mesh":
             from illumgrid.backends.mesh import bvh
-            from illumgrid.backends.mesh.meshes import Meshes
+            from illumgrid.backends.mesh.meshes import Meshes, check_opaque
 
+            check_opaque(scene)
             meshes = Meshes(scene, bvh.build)
         return NumbaTracer(self, scene, *laid_out(scene), meshes, pool(self.threads))
 

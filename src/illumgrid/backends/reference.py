@@ -4,6 +4,7 @@ The path loop has the headings of `kernels.walk`; everything that Numba's kernel
 meet is handed in: the trilinear level set here, its mesh in `embree`.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, ClassVar, Literal, Protocol
@@ -26,6 +27,7 @@ from illumgrid.constants import (
     CAP,
     LOST,
     MISS,
+    MOST_FILMS,
     NOWHERE,
     OFF_SWEEP,
     ON_A_VOXEL,
@@ -39,7 +41,7 @@ from illumgrid.field.scene import Scene
 from illumgrid.field.volume import Floats, central_differences, unit
 from illumgrid.grid.cache import NO_CACHE, Cache
 from illumgrid.grid.channels import Channels
-from illumgrid.rng import draw, draw_pair, stream
+from illumgrid.rng import draw, draw_pair, mix, stream
 from illumgrid.stages import Backend, hookimpl
 from illumgrid.transport.samples import Queries, Samples, in_frame, in_turn
 from illumgrid.transport.tracer import laid_out, solve_once
@@ -209,21 +211,75 @@ def meet_quad(scene: Marchable, q: int, x: Floats, d: Floats) -> Floats:
     return np.where(within & (approach != 0) & (behind == (approach > 0)), t, np.inf)
 
 
+def leave_shell(
+    surfaces: Surfaces, f: int, level: Floats, x: Floats, normal: Floats, d: Floats, own: Bools, face: Ints
+) -> tuple[Floats, Ints, Ints]:
+    """First meeting (t, what, face), each (n,), of rays within the shell of field f with its inner side, or a cap."""
+    scene, nowhere = surfaces.scene, np.full(len(x), NOWHERE)
+    t, what, _ = surfaces.meet(int(scene.twin[f]), -level, x, normal, d, own & (face == NOWHERE), nowhere)
+    end = scene.origin[f] + np.where(d > 0, scene.spacing[f] * (scene.shape[f] - 1), 0.0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        out = np.where(d != 0, (end - x) / d, np.inf)
+    cap = what == MISS
+    t, what = np.where(cap, np.maximum(out.min(axis=1), 0.0), t), np.where(cap, CAP, SURFACE)
+    return t, what, np.where(cap, out.argmin(axis=1), nowhere)
+
+
 def nearest_hit(
-    surfaces: Surfaces, level: Floats, x: Floats, normal: Floats, d: Floats, on: Ints, on_face: Ints
+    surfaces: Surfaces, level: Floats, x: Floats, normal: Floats, d: Floats, on: Ints, on_face: Ints, within: Ints
 ) -> tuple[Floats, Ints, Ints, Ints]:
-    """First surface along frame rays, which start on these normals: (t, number, what, face); fields come first."""
+    """First surface along frame rays, which start on these normals: (t, number, what, face); fields come first.
+
+    The rays start within the shells of the fields whose bits `within` (n,) has.
+    """
     scene, n = surfaces.scene, len(x)
     best, number, what, face = np.full(n, np.inf), np.full(n, -1), np.full(n, MISS), np.full(n, NOWHERE)
     for q in range(len(scene.quad_corner)):
-        t = np.where(on == len(scene.start) + q, np.inf, meet_quad(scene, q, x, d))
+        t = np.where(on == len(scene.twin) + q, np.inf, meet_quad(scene, q, x, d))
         closer = t < best
-        best[closer], number[closer], what[closer] = t[closer], len(scene.start) + q, QUAD
-    for f in range(len(scene.start)):
+        best[closer], number[closer], what[closer] = t[closer], len(scene.twin) + q, QUAD
+    for f in range(len(scene.twin)):
         t, hit, at = surfaces.meet(f, level[:, f], x, normal, d, on == f, on_face)
+        shell = np.flatnonzero(within >> f & 1)
+        if len(shell):
+            t[shell], hit[shell], at[shell] = leave_shell(
+                surfaces, f, level[shell, f], x[shell], normal[shell], d[shell], on[shell] == f, on_face[shell]
+            )
         closer = (hit != MISS) & (t < best)
         best[closer], number[closer], what[closer], face[closer] = t[closer], f, hit[closer], at[closer]
     return best, number, what, face
+
+
+def lets_through(scene: Marchable, number: Ints, what: Ints) -> Floats:
+    """Share (n,) of the light that goes straight through what rays met."""
+    share = np.zeros(len(number))
+    if len(scene.transmission):
+        film = ((what == SURFACE) | (what == CAP)) & (number >= 0) & (number < len(scene.twin))
+        share[film] = scene.transmission[number[film]]
+    return share
+
+
+def followed(
+    surfaces: Surfaces, level: Floats, x: Floats, normal: Floats, d: Floats, on: Ints, on_face: Ints, within: Ints,
+    passes: Callable[[int, Ints, Floats], Bools],
+) -> tuple[Floats, Ints, Ints, Ints]:  # fmt: skip
+    """As `nearest_hit`, after films: rays (m,) of those shares go through number k where passes(k, rays, shares) is so.
+
+    `within` (n,) changes with them.
+    """
+    t, number, what, face = nearest_hit(surfaces, level, x, normal, d, on, on_face, within)
+    ray = np.arange(len(x))
+    for film in range(MOST_FILMS):
+        share = lets_through(surfaces.scene, number[ray], what[ray])
+        ray, share = ray[share > 0], share[share > 0]
+        ray = ray[passes(film, ray, share)]
+        if not len(ray):
+            break
+        within[ray] ^= 1 << number[ray]
+        start = level[ray], x[ray] + t[ray, None] * d[ray], normal[ray], d[ray], number[ray], face[ray], within[ray]
+        more, number[ray], what[ray], face[ray] = nearest_hit(surfaces, *start)
+        t[ray] += more
+    return t, number, what, face
 
 
 def gradient_normal(scene: Marchable, f: int, x: Floats) -> Floats:
@@ -278,7 +334,7 @@ class Marching:
 
 
 def light_asked(
-    surfaces: Surfaces, u: Floats, level: Floats, on: Ints, on_face: Ints, x: Floats, normal: Floats
+    surfaces: Surfaces, u: Floats, level: Floats, on: Ints, on_face: Ints, x: Floats, normal: Floats, within: Ints
 ) -> tuple[Floats, Floats]:
     """Ask one light each for what arrives at x: weight (n,), and emission or radiance (n, C) that it goes with.
 
@@ -295,7 +351,7 @@ def light_asked(
         target = scene.quad_corner[q] + np.einsum("ni,nij->nj", u[some, :2], scene.quad_edges[q])
         distance = np.linalg.norm(target - x[some], axis=1)
         d[some] = (target - x[some]) / np.where(distance > 0, distance, 1.0)[:, None]
-        by_light[some], number[some] = lamp_density(scene, q, distance, d[some]), len(scene.start) + q
+        by_light[some], number[some] = lamp_density(scene, q, distance, d[some]), len(scene.twin) + q
         by_light[some[distance == 0]] = 0.0
         light[some] = scene.emission[number[some]]
     some = np.flatnonzero(u[:, 2] >= scene.asked[0])
@@ -304,10 +360,17 @@ def light_asked(
         by_light[some], light[some] = distant_density(scene, d[some]), asked_radiance(scene, d[some])
     by_cosine = np.einsum("ij,ij->i", normal, d) / np.pi
     ask = np.flatnonzero((by_cosine > 0) & (by_light > 0) & ((number != on) | (number < 0)))
-    # The ray that meets this lamp first, or nothing, has met nothing else before.
-    _, met, _, _ = nearest_hit(surfaces, level[ask], x[ask], normal[ask], d[ask], on[ask], on_face[ask])
+    # The ray that meets this lamp first, or nothing, has met nothing else before but films, which let a share through.
+    through = np.ones(len(ask))
+
+    def dimmed(film: int, ray: Ints, share: Floats) -> Bools:
+        through[ray] *= share
+        return np.ones(len(ray), bool)
+
+    start = level[ask], x[ask], normal[ask], d[ask], on[ask], on_face[ask], within[ask]
+    _, met, _, _ = followed(surfaces, *start, dimmed)
     weight = np.zeros(count)
-    weight[ask] = np.where(met == number[ask], by_cosine[ask] / (by_cosine[ask] + by_light[ask]), 0.0)
+    weight[ask] = np.where(met == number[ask], through * by_cosine[ask] / (by_cosine[ask] + by_light[ask]), 0.0)
     return weight, light
 
 
@@ -316,7 +379,8 @@ def place_in_sweep(cache: Cache, level: Floats) -> Floats:
     if not len(cache.start):
         return np.full(len(level), OFF_SWEEP)
     first, last = cache.sweep.T
-    share = (level - first) / (last - first)
+    with np.errstate(divide="ignore", invalid="ignore"):  # a level that is held has no place
+        share = (level - first) / (last - first)
     on = (np.abs(share - share[:, :1]) <= SAME_ROW) & (share >= -SAME_ROW) & (share <= 1 + SAME_ROW)
     return np.where(on.all(axis=1), np.clip(share[:, 0], 0, 1), OFF_SWEEP)
 
@@ -326,7 +390,7 @@ def cached_light(
 ) -> tuple[Floats, Bools]:
     """Cached irradiance (n, C) where rays met surfaces at x, and whether (n,) their paths end: `gathering`."""
     light, ends = np.zeros((len(x), cache.light.shape[1])), np.zeros(len(x), bool)
-    fields = len(scene.start)
+    fields = len(scene.twin)
     for lattice, (start, shape) in enumerate(zip(cache.start, cache.shape)):
         here = (number == lattice) & (place != OFF_SWEEP) & (t >= cache.near[lattice])
         if lattice < fields:
@@ -360,32 +424,40 @@ def walk(
     own_face: Ints,
     x: Floats,
     normal: Floats,
+    within: Ints,
 ) -> Floats:
     """Worth (n, C) of one path from each point of a surface: the irradiance is π times the mean.
 
-    `keep` is the share of the light that comes back along the path.
+    `keep` is the share of the light that comes back along the path; `within` (n,) has the bits of the fields in
+    whose shells it starts.
     """
-    scene = surfaces.scene
+    scene, within = surfaces.scene, within.copy()
     worth, keep = np.zeros((len(x), len(scene.background))), np.ones((len(x), len(scene.background)))
     place = place_in_sweep(cache, level)
     x, normal, on, on_face = x.copy(), normal.copy(), own.astype(np.int64), own_face.copy()
-    alive, fields = np.arange(len(x)), len(scene.start)
+    alive, fields = np.arange(len(x)), len(scene.twin)
     for segment in range(bounces + 1):
         # Ask a lamp or the sky for light, weighted against the chance that the ray below finds it. One pair of numbers
         # serves both: each keeps its mean, and their shared boxes keep the error bars short.
         u1, u2 = draw_pair(key[alive], path[alive], np.uint64(segment))
         if len(scene.lamps) or scene.asked[0] < 1:
             u = np.stack([u1, u2, draw(key[alive], path[alive], np.uint64(segment))], axis=1)
-            at = (level[alive], on[alive], on_face[alive], x[alive], normal[alive])
+            at = (level[alive], on[alive], on_face[alive], x[alive], normal[alive], within[alive])
             weight, light = light_asked(surfaces, u, *at)
             worth[alive] += keep[alive] * weight[:, None] * light
 
         # Choose a direction by the cosine about the normal.
         d = cosine_direction(u1, u2, normal[alive])
 
-        # Follow the ray to the nearest surface; one that dips under its own has hit it already.
-        start = level[alive], x[alive], normal[alive]
-        t, number, what, face = nearest_hit(surfaces, *start, d, on[alive], on_face[alive])
+        # Follow the ray to the nearest surface, by chance through films; one that dips under its own hit it already.
+        start, shells = (level[alive], x[alive], normal[alive]), within[alive]
+
+        def by_chance(film: int, ray: Ints, share: Floats, alive: Ints = alive, segment: int = segment) -> Bools:
+            own_key = mix(key[alive[ray]] + np.uint64(film + 1))
+            return np.asarray(draw(own_key, path[alive[ray]], np.uint64(segment)) < share)
+
+        t, number, what, face = followed(surfaces, *start, d, on[alive], on_face[alive], shells, by_chance)
+        within[alive] = shells
 
         # A path that escapes sees the sky, and ends.
         escaped, away = alive[what == MISS], d[what == MISS]
@@ -412,13 +484,15 @@ def walk(
         x[alive] += np.where(moved, t, 0.0)[:, None] * d
         for f in range(fields):
             here = np.flatnonzero(moved & (number == f))
-            normal[alive[here]] = surfaces.normal(f, what[here], face[here], x[alive[here]], d[here])
+            side = np.where((within[alive[here]] >> f & 1) & (what[here] == SURFACE), -1.0, 1.0)
+            normal[alive[here]] = side[:, None] * surfaces.normal(f, what[here], face[here], x[alive[here]], d[here])
         normal[alive[wall]] = -np.sign(approach)[:, None] * scene.quad_normal[quad]
 
         # End where the light is known.
         goes_on = normal[alive].any(axis=1)
-        if segment < bounces and len(cache.start):
-            met = np.where(moved, what, MISS)
+        if cache.after <= segment < bounces and len(cache.start):
+            inner = ~wall & (within[alive] >> np.where(wall, 0, number) & 1 == 1)  # of a shell: not in the grid
+            met = np.where(moved & ~inner, what, MISS)
             light, ends = cached_light(scene, cache, place[alive], number, met, t, x[alive], d)
             worth[alive] += keep[alive] * light / np.pi
             goes_on &= ~ends
@@ -437,8 +511,11 @@ def answer(
     mean, m2 = np.zeros((2, len(x), len(surfaces.scene.background)))
     x, face = surfaces.begin(target, x, normal)
     good = normal.any(axis=1) & (face != LOST)
-    for f in range(len(surfaces.scene.start)):
-        good &= (target == f) | ~surfaces.inside(f, level[:, f], x, normal)
+    within = np.zeros(len(x), np.int64)
+    for f, twin in enumerate(surfaces.scene.twin):
+        there = (target != f) & surfaces.inside(f, level[:, f], x, normal)
+        good &= ~there | (twin >= 0)
+        within |= there.astype(np.int64) << f
     asked = np.flatnonzero(good) if len(paths) else np.zeros(0, np.int64)
     step = max(1, BATCH // max(len(paths), 1))
     for at in range(0, len(asked), step):
@@ -448,7 +525,7 @@ def answer(
         with np.errstate(over="ignore"):  # the random numbers wrap around, on purpose
             light = walk(
                 surfaces, cache, key[every], block, bounces, level[every], target[every], face[every], x[every],
-                normal[every],
+                normal[every], within[every],
             )  # fmt: skip
         light = light.reshape(len(rows), len(paths), -1).swapaxes(0, 1)
         mean[rows] = np.pi * light.mean(axis=0)

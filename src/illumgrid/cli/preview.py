@@ -85,7 +85,7 @@ def preview(
         str | None,
         typer.Option(
             metavar="N|full[:N]",
-            help="Gather light by N rays from every pixel, each ending in the grid at its first hit: sharp shadows. "
+            help="Gather light by N rays from every pixel, each ending in the grid after a reflection: sharp shadows. "
             "full: paths of every length and no grid, the reference, 256 of them by default.",
         ),
     ] = None,

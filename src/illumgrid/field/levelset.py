@@ -105,11 +105,15 @@ class Marchable(NamedTuple):
     """All fields of a scene as flat arrays for marching by a compiled kernel, in the frame of the scene.
 
     The solid of every field is {sign v >= level}: for `inside` "below" the sign is -1, and levels change theirs too.
-    The bricks serve every isovalue.
+    The bricks serve every isovalue. A field that transmits has a second entry, after all F fields, whose solid is what
+    is outside: rays within its shell march that one, with minus the level.
     """
 
     values: NDArray[Any]  # of one of the types `field.volume.NATIVE`: all volumes one after the other, C order
-    sign: Floats  # (F,)
+    twin: NDArray[np.int64]  # (F,) entry of what is outside of a field that transmits; -1 for others
+    transmission: Floats  # (F,), or (0,) if no field transmits
+    # Here and up to the bricks the entries of fields, E of them: F, or more if some transmit.
+    sign: Floats  # (E,)
     start: NDArray[np.int64]  # (F,) offset of each field
     shape: NDArray[np.int64]  # (F, 3) voxels
     origin: Floats  # (F, 3) frame position of voxel 0
@@ -118,8 +122,8 @@ class Marchable(NamedTuple):
     bricks: NDArray[np.uint8]  # 128 bytes per brick, all fields concatenated
     brick_start: NDArray[np.int64]  # (F,) how many bricks come before
     brick_shape: NDArray[np.int64]  # (F, 3)
-    shift: NDArray[np.int64]  # (F,) a brick has 2^shift cells along each side
-    albedo: Floats  # (F + Q, 3): fields, then quads
+    shift: NDArray[np.int64]  # (E,) a brick has 2^shift cells along each side
+    albedo: Floats  # (F + Q, 3): fields, then quads; share that is reflected of what is not transmitted
     emission: Floats  # (F + Q, 3)
     background: Floats  # (3,) constant radiance from all directions outside
     quad_corner: Floats  # (Q, 3) in the frame, as all that follows
@@ -175,24 +179,31 @@ def marchable(scene: Scene, channels: Sequence[Channel] = ALL) -> Marchable:
 
     Albedos and lights have a column for each of `channels`, by default red, green and blue of all light together.
     """
-    values, start = _together([f.volume for f in scene.fields])
-    bricks = [_bricks_of(f.volume, f.upward) for f in scene.fields]
+    films = [f for f in scene.fields if f.material.transmission > 0]
+    entries = [(f.volume, f.upward) for f in scene.fields] + [(f.volume, -f.upward) for f in films]
+    values, start = _together([volume for volume, _ in entries])
+    bricks = [_bricks_of(volume, sign) for volume, sign in entries]
     records = [b.records.reshape(-1) for b in bricks]
     materials = [f.material for f in scene.fields] + [q.material for q in scene.quads]
+    through = np.array([f.material.transmission for f in scene.fields])
+    kept = np.array([1.0 - m.transmission for m in materials])[:, None]
+    albedo = np.array([m.albedo for m in materials])
     colors, tables = [channel.color for channel in channels], light_tables(scene, channels)
     return Marchable(
         values=values,
-        sign=np.array([f.upward for f in scene.fields]),
+        twin=np.where(through > 0, len(through) - 1 + np.cumsum(through > 0), -1),
+        transmission=through if films else np.zeros(0),
+        sign=np.array([sign for _, sign in entries]),
         start=start,
-        shape=np.array([f.volume.shape for f in scene.fields], dtype=np.int64),
-        origin=scene.to_frame([f.volume.origin for f in scene.fields]),
-        spacing=np.array([f.volume.spacing for f in scene.fields]),
+        shape=np.array([volume.shape for volume, _ in entries], dtype=np.int64),
+        origin=scene.to_frame([volume.origin for volume, _ in entries]),
+        spacing=np.array([volume.spacing for volume, _ in entries]),
         steps=np.array([b.steps for b in bricks]),
         bricks=records[0] if len(records) == 1 else np.concatenate(records),
         brick_start=np.cumsum([0, *(len(b.records) for b in bricks)], dtype=np.int64)[:-1],
         brick_shape=np.array([b.shape for b in bricks], dtype=np.int64),
         shift=np.array([b.shift for b in bricks], dtype=np.int64),
-        albedo=np.ascontiguousarray(np.array([material.albedo for material in materials])[:, colors]),
+        albedo=np.ascontiguousarray(np.divide(albedo, kept, out=np.zeros_like(albedo), where=kept > 0)[:, colors]),
         **_quads_in_frame(scene, tables),
         **tables,
     )

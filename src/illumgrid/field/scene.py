@@ -32,14 +32,42 @@ class Material:
         Fraction of the light that is reflected, linear RGB, 0 to 1.
     emission : (3,) array_like
         Emitted radiance, linear RGB.
+    transmission : float
+        Fraction of the light that goes straight through, 0 to 1: the solid of a field is then a thin shell, with light
+        inside. What is neither reflected nor transmitted is absorbed.
     """
 
     albedo: Floats = field(default_factory=lambda: np.full(3, 0.8))
     emission: Floats = field(default_factory=lambda: np.zeros(3))
+    transmission: float = 0.0
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "albedo", _rgb(self.albedo, "albedo", 1.0))
         object.__setattr__(self, "emission", _rgb(self.emission, "emission", np.inf))
+        if not 0.0 <= self.transmission <= 1.0:
+            raise BadInput(f"transmission is {self.transmission}; expected a number from 0 to 1")
+        if self.transmission > 0 and self.albedo.max() + self.transmission > 1.0 + 1e-9:
+            raise BadInput(
+                f"transmission is {self.transmission} and albedo {self.albedo.tolist()}; expected no more than 1 "
+                "together: a surface cannot send on more light than it gets"
+            )
+        if self.transmission > 0 and self.emission.any():
+            raise BadInput("a material with transmission has an emission; expected one of the two: leave one out")
+
+
+_HELD = 1e-5
+"""Half the width of the range of a level that is held, as a share of the data's: nodes beside it are on it."""
+
+
+def _around(volume: Volume, name: str, isovalue: float) -> Floats:
+    """The range (2,) of a level that is held."""
+    low, high = volume.extremes
+    if not low <= isovalue <= high:
+        raise BadInput(
+            f"the isovalue {isovalue:g} of field {name!r} misses its data, which run from "
+            f"{shown_range((low, high), 6)}; choose one between them"
+        )
+    return isovalue + _HELD * max(high - low, abs(isovalue) * 1e-3) * np.array([-1.0, 1.0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,6 +86,9 @@ class Field:
         Which side of the level set is solid: h >= c or h <= c.
     falling : bool
         Whether the sweep runs from the high end of the range to the low end.
+    isovalue : float, optional
+        A level that is held while the other fields sweep: a fixed body beside them. It takes the place of `range`, and
+        the body's light is known at several places of the sweep: see `IlluminationGrid.lookup`.
     """
 
     name: str
@@ -66,6 +97,7 @@ class Field:
     range: Floats = None  # type: ignore[assignment]
     inside: Side = "above"
     falling: bool = False
+    isovalue: float | None = None
 
     def __post_init__(self) -> None:
         if not (isinstance(self.name, str) and self.name and self.name.isprintable()):
@@ -73,6 +105,9 @@ class Field:
         if self.inside not in UPWARD:
             raise BadInput(f"inside of field {self.name!r} is {self.inside!r}; expected 'above' or 'below'")
         volume = finite(self.volume, self.inside)
+        if self.isovalue is not None:
+            object.__setattr__(self, "isovalue", float(self.isovalue))
+            object.__setattr__(self, "range", _around(volume, self.name, float(self.isovalue)))
         asked = suggest_range(volume, self.inside)[:2] if self.range is None else self.range
         limits = np.array(asked, dtype=float)
         largest = np.finfo(np.float32).max  # stored values are float32
@@ -113,10 +148,17 @@ class Field:
     @property
     def sweep(self) -> Floats:
         """Isovalues (2,) at t = 0 and t = 1: the ends of the range, the high one first if the field is `falling`."""
+        if self.isovalue is not None:
+            return np.full(2, self.isovalue)
         return self.range[::-1] if self.falling else self.range
 
     def place(self, isovalues: ArrayLike) -> Floats:
-        """Position of isovalues in the sweep: 0 at its first isovalue, 1 at its last, not clamped."""
+        """Position of isovalues in the sweep: 0 at its first isovalue, 1 at its last, not clamped.
+
+        Of a level that is held, the middle: it says nothing of the other fields.
+        """
+        if self.isovalue is not None:
+            return np.full(np.shape(isovalues), 0.5)
         first, last = self.sweep
         return np.asarray((np.asarray(isovalues, float) - first) / (last - first))
 
@@ -156,6 +198,8 @@ class Quad:
                 raise BadInput(f"{name} of quad {self.name!r} is {vector.tolist()}; expected three finite numbers")
             vector.setflags(write=False)
             object.__setattr__(self, name, vector)
+        if self.material.transmission > 0:
+            raise BadInput(f"quad {self.name!r} has a transmission; expected one for a field only")
         lengths = np.linalg.norm(self.edge_u) * np.linalg.norm(self.edge_v)
         if not np.linalg.norm(np.cross(self.edge_u, self.edge_v)) > 1e-6 * lengths:
             raise BadInput(f"the edges of quad {self.name!r} are parallel or zero; expected two that span an area")

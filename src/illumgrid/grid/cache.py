@@ -35,6 +35,7 @@ class Cache(NamedTuple):
     spacing: Floats  # (F, 3)
     near: Floats  # (F + Q,) distance below which a ray is too short to end: neighbours would light themselves
     sweep: Floats  # (F, 2) levels at the two ends of the sweep, turned and as stored
+    after: int = 0  # reflections before a path may end
 
 
 NO_CACHE = Cache(
@@ -46,7 +47,7 @@ NO_CACHE.light.flags.writeable = False
 
 
 def cache_of(
-    scene: Scene, grids: Sequence[IlluminationGrid], walls: Sequence[WallTexture], alike: float = ALIKE
+    scene: Scene, grids: Sequence[IlluminationGrid], walls: Sequence[WallTexture], alike: float = ALIKE, after: int = 0
 ) -> Cache:
     """Lay out the light of a scene as a cache.
 
@@ -62,6 +63,8 @@ def cache_of(
         One a quad.
     alike : float
         Infinite to trust all cells without holes.
+    after : int
+        Reflections before a path may end: each weakens what the cache is off.
 
     Raises
     ------
@@ -94,6 +97,7 @@ def cache_of(
         spacing=np.array([grid.spec.spacing for grid in grids], float),
         near=np.array([*(grid.spec.spacing.max() for grid in grids), *texel], float),
         sweep=np.array([field.upward * field.volume.to_stored(field.sweep) for field in scene.fields], float),
+        after=after,
     )
 
 

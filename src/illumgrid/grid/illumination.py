@@ -44,6 +44,9 @@ class IlluminationGrid:
         By default grey for one channel, RGB for three.
     errors : (nx, ny, nz, C) float32, optional
         Standard error of each channel, for the error of another mix of several layers.
+    rows : tuple of IlluminationGrid, optional
+        Of a field whose level is held: the same at equal steps of the sweep of the other fields. The arrays of the grid
+        itself are those in its middle.
 
     Attributes
     ----------
@@ -57,6 +60,7 @@ class IlluminationGrid:
     support: NDArray[np.float32]
     channels: Channels = None  # type: ignore[assignment]
     errors: NDArray[np.float32] | None = None
+    rows: tuple["IlluminationGrid", ...] = ()
     light: NDArray[np.float32] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -83,13 +87,26 @@ class IlluminationGrid:
             known = np.isfinite(self.errors)  # infinite times 0 is no number
             bound = np.where(known, self.errors, np.float32(0)) @ np.abs(np.array(channels.mix, np.float32))
             error = np.where(known.all(axis=-1), np.sqrt(np.square(bound).mean(axis=-1)), np.inf)
-        return replace(self, values=self.light, channels=channels, error=error)
+        rows = tuple(row.showing(channels) for row in self.rows)
+        return replace(self, values=self.light, channels=channels, error=error, rows=rows)
 
-    def lookup(self, points: ArrayLike) -> NDArray[np.float32]:
+    def lookup(self, points: ArrayLike, t: float = 0.5) -> NDArray[np.float32]:
         """Irradiance (n, 3) at world points (n, 3), trilinear between nodes; beyond the border, that of the border.
 
         Never NaN: coordinates that are not finite read the border.
+
+        Parameters
+        ----------
+        points : (n, 3) array_like
+        t : float
+            Place in the sweep, 0 to 1, of the fields beside one whose level is held; without meaning for others.
         """
+        if self.rows:
+            place = float(np.clip(t, 0.0, 1.0)) * (len(self.rows) - 1)
+            below = min(int(place), len(self.rows) - 2)
+            share = np.float32(place - below)
+            one, other = (row.lookup(points) for row in self.rows[below : below + 2])
+            return (1 - share) * one + share * other
         return np.ascontiguousarray(self.channels.rgb(read_lattice(self.spec, self.light, points)))
 
     def covered(self, points: ArrayLike) -> NDArray[np.bool_]:

@@ -20,7 +20,7 @@ import hashlib
 import json
 import os
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -239,6 +239,7 @@ def _describe(stored: Stored) -> Record:
         {"name": f.name, "range": f.range.tolist(), "inside": f.inside, "falling": f.falling}
         | {"slope": f.volume.slope, "intercept": f.volume.intercept, "unit": f.volume.unit}
         | {"albedo": f.material.albedo.tolist(), "emission": f.material.emission.tolist()}
+        | ({"transmission": f.material.transmission} if f.material.transmission else {})
         | {"type": f.volume.values.dtype.name, "extremes": f.volume.extremes}
         | {"histogram": histogram(f.volume, BINS)[0].tolist()}
         | lattice(f.volume)
@@ -250,6 +251,8 @@ def _describe(stored: Stored) -> Record:
         | {"albedo": q.material.albedo.tolist(), "emission": q.material.emission.tolist()}
         for q in stored.scene.quads
     ]
+    for about, f in zip(fields, stored.scene.fields):
+        about.update({} if f.isovalue is None else {"isovalue": f.isovalue})
     lit = {f"light/{f.name}": grid.channels for f, grid in zip(stored.scene.fields, stored.grids)}
     lit |= {f"wall/{q.name}": wall.channels for q, wall in zip(stored.scene.quads, stored.walls)}
     record = {
@@ -259,7 +262,9 @@ def _describe(stored: Stored) -> Record:
         | {"lights": [_described(light) for light in stored.scene.lights]},
         "levels": np.asarray(stored.levels.table, float).tolist(),
         "grids": {
-            f.name: lattice(grid.spec) | {"lit": float((grid.support > 0).mean())}
+            f.name: lattice(grid.spec)
+            | {"lit": float((grid.support > 0).mean())}
+            | ({"rows": len(grid.rows)} if grid.rows else {})
             for f, grid in zip(stored.scene.fields, stored.grids)
         },
         "channels": {part: asdict(channels) for part, channels in lit.items()},
@@ -326,13 +331,13 @@ def _rebuild(record: Record, plan: Plan, parts: exr.Parts, volumes: list[Volume]
             _channels(record, part),
             parts.pop(part),
         )
-        values, error, support = (exr.array(light, names, spec.shape) for names in (channels.names, "error", "support"))
-        errors = exr.array(light, tuple(_errors(channels)), spec.shape) if _errors(channels) else None
-        grids.append(IlluminationGrid(spec, values, error, support, channels, errors))
+        rows = tuple(_grid(spec, channels, parts.pop(part)) for part in _rows(record, about["name"]))
+        grids.append(replace(_grid(spec, channels, light), rows=rows) if rows else _grid(spec, channels, light))
         volume = _field_volume(record, about, plan, parts) if volumes is None else volumes[number]
-        material = Material(about["albedo"], about["emission"])
+        material = Material(about["albedo"], about["emission"], about.get("transmission", 0.0))
         falling = about.get("falling", False)
-        fields.append(Field(about["name"], volume, material, about["range"], about["inside"], falling))
+        held = about.get("isovalue")
+        fields.append(Field(about["name"], volume, material, about["range"], about["inside"], falling, held))
     quads, walls = [], []
     for about in record["scene"]["quads"]:
         part, shape = f"wall/{about['name']}", _wall_shape(about, record)
@@ -345,6 +350,23 @@ def _rebuild(record: Record, plan: Plan, parts: exr.Parts, volumes: list[Volume]
     lights = tuple(map(_light, record["scene"].get("lights", [])))
     scene = Scene(tuple(fields), tuple(quads), record["scene"]["background"], lights)
     return Stored(scene, Levels(np.array(record["levels"], float)), tuple(grids), tuple(walls), record["recipe"])
+
+
+def _grid(spec: GridSpec, channels: Channels, light: Any) -> IlluminationGrid:
+    values, error, support = (exr.array(light, names, spec.shape) for names in (channels.names, "error", "support"))
+    errors = exr.array(light, tuple(_errors(channels)), spec.shape) if _errors(channels) else None
+    return IlluminationGrid(spec, values, error, support, channels, errors)
+
+
+MOST_ROWS = 64
+
+
+def _rows(record: Record, field: str) -> list[str]:
+    """Names of the parts that hold a field's grid at places of the sweep, if its level is held."""
+    count = record["grids"][field].get("rows", 0)
+    if not (isinstance(count, int) and 0 <= count <= MOST_ROWS and count != 1):
+        raise BadInput(f"the rows of field {field!r} are {str(count)[:40]!r}; expected 2 to {MOST_ROWS}, or none")
+    return [f"rows/{row}/{field}" for row in range(count)]
 
 
 def _shape(about: Record) -> tuple[int, int, int]:
@@ -381,7 +403,8 @@ def _plan(record: Record) -> Plan:
         part = f"light/{about['name']}"
         channels = _channels(record, part)
         names = (*channels.names, *_errors(channels), "error", "support")
-        plan[part] = exr.Planned(_shape(record["grids"][about["name"]]), names)
+        for one in (part, *_rows(record, about["name"])):
+            plan[one] = exr.Planned(_shape(record["grids"][about["name"]]), names)
         if "source" not in record:
             plan[f"field/{about['name']}"] = _planned_field(record, about)
     for about in record["scene"]["quads"]:
@@ -407,12 +430,17 @@ def _write_exr(path: Path, stored: Stored) -> None:
         return exr.Planned(shape, tuple(arrays)), {name: exr.image(array) for name, array in arrays.items()}
 
     parts: dict[str, tuple[exr.Planned, dict[str, exr.Image]]] = {}
-    for f, grid in zip(stored.scene.fields, stored.grids):
+
+    def of_grid(grid: IlluminationGrid) -> tuple[exr.Planned, dict[str, exr.Image]]:
         arrays = split(grid) | {"error": grid.error, "support": grid.support}
         if names := _errors(grid.channels):
             errors = np.full(grid.light.shape, np.inf, np.float32) if grid.errors is None else grid.errors
             arrays |= {name: errors[..., c] for c, name in enumerate(names)}
-        parts[f"light/{f.name}"] = images(arrays)
+        return images(arrays)
+
+    for f, grid in zip(stored.scene.fields, stored.grids):
+        parts[f"light/{f.name}"] = of_grid(grid)
+        parts |= {f"rows/{k}/{f.name}": of_grid(row) for k, row in enumerate(grid.rows)}
         if stored.source is None:
             parts[f"field/{f.name}"] = exr.of_field(f.volume.values)
     for quad, wall in zip(stored.scene.quads, stored.walls):

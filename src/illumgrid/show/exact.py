@@ -1,7 +1,8 @@
 """Exact pictures: rays from what a pixel shows gather light, and blend with the lookup by what is known of each.
 
-A gathered ray ends at its first hit, in the light that grids and walls hold there: what they are off enters through one
-reflection only, averaged over the hemisphere, and shadows are as sharp as the pixels. See `illumgrid.grid.cache`.
+A gathered ray is reflected once and ends at its second hit, in the light that grids and walls hold there: what they are
+off enters through two reflections only, averaged over hemispheres, and shadows are as sharp as the pixels. See
+`illumgrid.grid.cache`. Rays that end at the first hit cost less, and keep too much of the error: see the docs.
 """
 
 from collections.abc import Callable, Iterator
@@ -68,8 +69,8 @@ def tracer_of(light: Illumination, full: bool) -> tuple["Callable[..., tuple[Col
             tracer = prepare(Numba(), light.scene)
             bounces = 2 * enough_bounces(light.scene, tracer)[0]  # of what was left out a square is left out
         else:
-            tracer = prepare(Numba(), light.scene, cache_of(light.scene, light.grids, light.walls))
-            bounces = int(light.recipe.get("bounces", 8)) + 1
+            tracer = prepare(Numba(), light.scene, cache_of(light.scene, light.grids, light.walls, after=1))
+            bounces = int(light.recipe.get("bounces", 8)) + 2
         light.__dict__[key] = tracer, bounces
     tracer, bounces = light.__dict__[key]
 
@@ -86,7 +87,7 @@ def looked_up(shown: Shown, hits: Hits) -> tuple[Colors, Floats]:
     light, variance = np.zeros((len(hits.what), 3), np.float32), np.ones(len(hits.what))
     for k, grid in enumerate(shown.light.grids):
         lit = hits.lit(k)
-        light[lit] = grid.lookup(hits.point[lit])
+        light[lit] = grid.lookup(hits.point[lit], shown.share)
         variance[lit] = np.square(grid.uncertainty(hits.point[lit]), dtype=float)
     for k, wall in enumerate(shown.light.walls):
         lit = hits.lit(len(shown.light.grids) + k)
@@ -141,7 +142,7 @@ class Gathering:
         From rays of their own at points spread over the picture. Weights that depended on the rays they weigh would
         darken it: a pixel that no ray found bright would count as known. Two independent answers G and G' for the
         lookup L tell both apart: the mean of (G - G')² is twice the variance of each, that of (L - G)(L - G') the
-        variance of L, whatever its cause.
+        variance of L, whatever its cause. Its own standard error is added: little trust where little is known.
         """
         solve, _ = tracer_of(self.shown.light, False)
         random = np.random.default_rng(self.seed)
@@ -164,7 +165,8 @@ class Gathering:
             chosen = chosen & good
             if not chosen.any():
                 return np.array([1.0, 0.0, 1.0])
-            return np.array([of_ray[chosen].mean(), max(of_lookup[chosen].mean(), 0.0), known[rows][chosen].mean()])
+            lookup = max(of_lookup[chosen].mean(), 0.0) + of_lookup[chosen].std() / np.sqrt(chosen.sum())
+            return np.array([of_ray[chosen].mean(), lookup, known[rows][chosen].mean()])
 
         each = [hits.number[rows] == k for k in range(self.surfaces)]
         whole = np.ones(len(rows), bool)
@@ -219,14 +221,14 @@ class Gathering:
                     band = range(first, min(first + rows, self.height))
                     part = slice(band.start * per_row, band.stop * per_row)
                     hits = self._hits(pool, band)
-                    pixel = self._gather(hits, band.start, some, total[part], count[part])
+                    pixel = self.gather(hits, band.start, some, total[part], count[part])
                     light = self.blended(hits, pixel, total[part], count[part])
                     color = software.colors_of(self.shown, hits, background, light)
                     strips.append(software.averaged(color, self.width))
                     progress(f"{some[-1][1]} rays a pixel", band.stop, self.height)
                 yield np.concatenate(strips)
 
-    def _gather(
+    def gather(
         self, hits: Hits, first: int, steps: list[tuple[int, int]], total: Colors, count: NDArray[np.int32]
     ) -> NDArray[np.int64]:
         """Add light and number of these paths to those of sub-samples (n,) from picture row `first` on.

@@ -71,7 +71,7 @@ class Shown:
         albedo = self.scene.fields[number].material.albedo
         if self.local:
             return self._lamplit(albedo / albedo.max(initial=1e-9), facing)
-        light = self.light.grids[number].lookup(points) if light is None else light
+        light = self.light.grids[number].lookup(points, self.share) if light is None else light
         return curve(light * (albedo / np.pi * self.exposure).astype(np.float32))
 
     def cap(self, number: int) -> Colors:

@@ -383,7 +383,21 @@ def lobe() -> Case:
     return _pictured("lobe", lambda d: np.maximum(d @ normal, 0.0) ** 4, "E = 2π/(n + 2)", np.pi / 3, field, queries)
 
 
+def shell() -> Case:
+    """A ball that reflects all, within a closed shell of albedo 0.3 and transmission 0.5, under a sky of 1."""
+    outer = ball()
+    film = replace(outer, name="shell", material=Material(np.full(3, 0.3), transmission=0.5))
+    inner = -((_RADIUS / 2) ** 2)
+    scene = Scene((film, replace(ball(1.0), isovalue=inner)), background=np.ones(3))
+    points = 0.5 * _on_ball(Scene((outer,)), 100).point
+    queries = Queries.at(scene, points, field=1, level=inner)
+    # Radiance X is the same everywhere inside, X = 0.5 + 0.3 X; between two reflections at the ball one is at it.
+    reason = "E = π τ L / (1 - a) inside"
+    return replace(_case("within a film", scene, queries, np.pi * 0.5 / 0.7, 24, reason, 0.3**12), voxels=True)
+
+
 CASES = (
+    shell,
     furnace,
     furnace_on_voxels,
     cavity,

@@ -97,7 +97,7 @@ def settle(scene, own, x, n):
 
     Along its normal, or where noise turns that aside, along the normal of its cell; LOST if neither leads there.
     """
-    if own >= scene.start.shape[0]:
+    if own >= scene.twin.shape[0]:
         return x, NOWHERE
     at, face = settle_along(scene, own, x, n)
     if face == LOST:

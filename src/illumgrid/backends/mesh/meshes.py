@@ -35,6 +35,21 @@ OFF = 2.0**-19
 a triangle, an origin and a hit, four times over."""
 
 
+def check_opaque(scene: Scene) -> None:
+    """Refuse fields that transmit: the inner sides of meshes are met by accident only.
+
+    Raises
+    ------
+    BadInput
+    """
+    for film in scene.fields:
+        if film.material.transmission > 0:
+            raise BadInput(
+                f"field {film.name!r} has a transmission, which meshes do not know; expected the backend numba with "
+                "the surface levelset, or reference"
+            )
+
+
 @dataclass(frozen=True, eq=False)
 class LevelMesh:
     """The solid of one field at one level: a closed mesh, and what casts rays at it.

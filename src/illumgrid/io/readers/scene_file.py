@@ -37,13 +37,13 @@ def read_scene(path: str | os.PathLike[str], *, smoothing: float = 0.0) -> Scene
     path : str or path-like
         UTF-8, at most 1 MB, with these tables: ``[[field]]``, one or more, with `name`, `volume` (what `read_volume`
         reads, relative to this file), or `points` with `spacing`, `sigma` and perhaps `weights`, `columns`, `cell` (see
-        `density`), and perhaps `albedo`, `emission`, `range`, `inside`, `falling`, `signed` (true:
-        two fields, ``NAME-positive`` where h >= c and ``NAME-negative`` where h <= -c), and the options of
-        `read_volume` (`spacing`, `channel`, `time`, `array`, `label`, `crop`, `downsample`, `follow`); ``[[quad]]``
-        with `name`, `corner`, `edge_u`, `edge_v` and perhaps `albedo`, `emission`, `texels`, `light`; ``[[light]]``
-        with `name` and either `radiance`, or `nadir` and `zenith`, or `image`, or `direction`, `angle` and
-        `irradiance`, see `Sky` and `Distant`; ``[background]`` with `radiance`. What
-        is left out has the default of `Field`, `Material`, `Quad` or `Scene`.
+        `density`), and perhaps `albedo`, `emission`, `transmission`, `range`, or `isovalue` (held while others sweep),
+        `inside`, `falling`, `signed` (true: two fields, ``NAME-positive`` where h >= c and ``NAME-negative`` where
+        h <= -c), and the options of `read_volume` (`spacing`, `channel`, `time`, `array`, `label`, `crop`,
+        `downsample`, `follow`); ``[[quad]]`` with `name`, `corner`, `edge_u`, `edge_v` and perhaps `albedo`,
+        `emission`, `texels`, `light`; ``[[light]]`` with `name` and either `radiance`, or `nadir` and `zenith`, or
+        `image`, or `direction`, `angle` and `irradiance`, see `Sky` and `Distant`; ``[background]`` with `radiance`.
+        What is left out has the default of `Field`, `Material`, `Quad` or `Scene`.
     smoothing : float, optional
         Standard deviation, in voxels, of a Gaussian that blurs every field before anything else.
 
@@ -203,12 +203,28 @@ _DENSITY: Mapping[str, Take] = {
     "cell": _cell,
 }
 """What `density` takes beside the points."""
+
+
+def _share(key: str, value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value <= 1:
+        raise BadInput(f"{key} is {_shown(value)}; expected a number from 0 to 1")
+    return float(value)
+
+
+def _level(key: str, value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= 1.7e308:
+        raise BadInput(f"{key} is {_shown(value)}; expected a number")
+    return float(value)
+
+
 _MATERIAL = {"albedo": _COLOUR, "emission": _COLOUR}
 _FIELD: Mapping[str, Take] = {
     "name": _text,
     "volume": _text,
     **_MATERIAL,
+    "transmission": _share,
     "range": _numbers(2, "two numbers in brackets (lowest and highest isovalue)", most=1.7e308),
+    "isovalue": _level,
     "inside": _side,
     "falling": _yes,
     "signed": _yes,
@@ -343,8 +359,10 @@ def _light(table: Table, folder: Path) -> Light:
 
 def _fields(table: Table, volume: Volume) -> tuple[Field, ...]:
     """The field of a checked table, or the two of a signed one."""
+    if "isovalue" in table and "range" in table:
+        raise BadInput("range and isovalue came together; expected one of them: a level that is held has no range")
     if table.get("signed"):
-        for key in ("inside", "falling"):
+        for key in ("inside", "falling", "isovalue"):
             if key in table:
                 raise BadInput(f"signed and {key} came together; expected one of them; leave {key} out")
         return signed_pair(table["name"], volume, table.get("range"), table["material"])
@@ -358,8 +376,9 @@ def _without(table: Table, keys: Mapping[str, Any]) -> Table:
 
 def _with_material(table: Table) -> Table:
     """The table with `material` in place of `albedo` and `emission`; None for a signed field that says neither."""
-    given = {key: table[key] for key in _MATERIAL if key in table}
-    return {**_without(table, _MATERIAL), "material": None if table.get("signed") and not given else Material(**given)}
+    keys = {**_MATERIAL, "transmission": 0}
+    given = {key: table[key] for key in keys if key in table}
+    return {**_without(table, keys), "material": None if table.get("signed") and not given else Material(**given)}
 
 
 def _volume(table: Table, folder: Path, smoothing: float, read: dict[str, Volume]) -> Volume:

@@ -1,0 +1,123 @@
+"""Error against time of (a) a lookup, (b) a resting picture, its rays ending in the grid, (c) plain path tracing.
+
+The same kernels trace the same visible points of a view that no run has seen. Errors are relative root mean squares of
+the irradiance over the pixels, against paths of every length from other seeds; half the difference of two such
+references is their own error, whose square is taken off. Seconds are those of all processors, scaled to a picture of
+640 x 480.
+
+    python benchmarks/exact.py [--only NAME] [--out FOLDER]
+"""
+
+import argparse
+import json
+import time
+from pathlib import Path
+
+import numpy as np
+
+import illumgrid as ig
+from illumgrid.field.volume import smooth
+from illumgrid.show import fit_camera
+from illumgrid.show.engines import software
+from illumgrid.show.exact import Exact, Gathering, looked_up, steps_to
+from illumgrid.show.picture import _shown
+
+VOLUMES = Path("/data")
+SIZE = 128, 96
+TRUTH = 512
+FULL = 640 * 480
+
+
+def scenes(volumes):
+    """Three scenes: a smooth field under the sky, a brain smoothed by a voxel, and a field in the box."""
+    yield "neghip", lambda: ig.Scene.sky(ig.read_volume(volumes / "neghip.nrrd")), 64
+    brain = lambda: smooth(ig.read_volume(volumes / "stroke_T1.nii.gz"), 1.0)  # noqa: E731
+    yield "brain", lambda: ig.Scene.sky(brain(), range=(60, 110)), 112
+    yield "box", lambda: ig.Scene.box(ig.read_volume(volumes / "nucleon.nrrd")), 48
+
+
+def seen(light, exact):
+    """What gathers for the view, and its first hits."""
+    row = light.scene.levels(0.37)[0]
+    shown = _shown(light, None, float(row[0]), False, False, 0.0)
+    camera = fit_camera(light.scene, row, SIZE[0] / SIZE[1], None if light.scene.quads else (215.0, 25.0))
+    made = Gathering(shown, camera, *SIZE, exact)
+    return made, software.first_hits(
+        shown, camera.eye, software.directions_of(camera, SIZE[0], range(SIZE[1]), SIZE[1])
+    )
+
+
+def by_pixel(hits, pixel, light):
+    """Irradiance in the mean over the sub-samples (p, 3) of each pixel that shows one surface."""
+    number = np.where(hits.what == 0, hits.number, hits.number)
+    groups = pixel * (number.max() + 1) + number
+    lit = np.concatenate([hits.lit(k) for k in range(number.max() + 1)])
+    _, inverse, many = np.unique(groups[lit], return_inverse=True, return_counts=True)
+    mean = np.stack([np.bincount(inverse, light[lit, c]) / many for c in range(3)], axis=1)
+    return mean[many == software.SIDE**2]
+
+
+def gathered(light, exact, seed_shift=0):
+    """Pictures after each step: (rays, seconds of all processors so far, irradiance by pixel)."""
+    made, hits = seen(light, exact)
+    made.__dict__["seed"] = made.seed + seed_shift
+    made.trust  # noqa: B018  compiled, and its trial rays traced
+    total, count = np.zeros((len(hits.what), 3), np.float32), np.zeros(len(hits.what), np.int32)
+    made.gather(hits, 0, [(0, 1)], total.copy(), count.copy())
+    low, spent = 0, 0.0
+    for high in steps_to(exact.paths):
+        begun = time.process_time()
+        pixel = made.gather(hits, 0, [(low, high)], total, count)
+        spent += time.process_time() - begun
+        yield high, spent, by_pixel(hits, pixel, made.blended(hits, pixel, total, count))
+        low = high
+
+
+def measure(name, scene, grid, paths):
+    """The table of one scene."""
+    scene = scene()
+    begun = time.process_time()
+    light = ig.run(scene, grid=grid, paths=32, seed=0)
+    row = {"scene": name, "run": time.process_time() - begun, "bounces": light.recipe["bounces"]}
+    one, other = (list(gathered(light, Exact(TRUTH, True), 1000 + k))[-1][2] for k in range(2))
+    truth, noise = (one + other) / 2, np.square((one - other) / 2).mean()
+
+    def error(found):
+        square = np.square(found - truth).mean()
+        return float(np.sqrt(max(square - noise, 0.0)) / truth.mean()), float((found - truth).mean() / truth.mean())
+
+    made, hits = seen(light, Exact(1))
+    pixel = np.arange(len(hits.what))
+    y, x = np.divmod(pixel, SIZE[0] * software.SIDE)
+    pixel = y // software.SIDE * SIZE[0] + x // software.SIDE
+    begun = time.process_time()
+    found = looked_up(made.shown, hits)[0]
+    scale = FULL / (SIZE[0] * SIZE[1])
+    row["lookup"] = {"seconds": (time.process_time() - begun) * scale, "error": error(by_pixel(hits, pixel, found))}
+    row["truth"] = float(np.sqrt(noise) / truth.mean())
+    row["trust"] = made.trust.tolist()
+    for kind, exact in (("resting", Exact(paths)), ("path tracing", Exact(256, True))):
+        row[kind] = [
+            {"rays": rays, "seconds": seconds * scale, "error": error(found)}
+            for rays, seconds, found in gathered(light, exact)
+        ]
+    return row
+
+
+def main():
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--volumes", type=Path, default=VOLUMES)
+    parser.add_argument("--only")
+    parser.add_argument("--paths", type=int, default=1024)
+    parser.add_argument("--out", type=Path, default=Path("exact.json"))
+    given = parser.parse_args()
+    rows = []
+    for name, scene, grid in scenes(given.volumes):
+        if given.only in (None, name):
+            rows.append(measure(name, scene, grid, given.paths))
+            print(json.dumps(rows[-1]), flush=True)
+    given.out.write_text(json.dumps(rows, indent=1))
+
+
+if __name__ == "__main__":
+    main()
