@@ -17,7 +17,8 @@ def described(light: Illumination, names: list[str]) -> dict[str, Any] | None:
     """Lights as the exposure shows them, each with its number among the page's sliders `names`, -1 if it has none.
 
     None where the page would need more than it holds: under images of the sky, in which a ray finds what is small and
-    bright too seldom, beside fields that shine, transmit or are held at one level, and with more surfaces than `MOST_SURFACES`.
+    bright too seldom, beside fields that shine, transmit or are held at one level, and with more surfaces than
+    `MOST_SURFACES`.
     """
     scene = light.scene
     materials = [field.material for field in scene.fields]
