@@ -95,6 +95,16 @@ def test_a_row_counts_only_when_all_of_it_is_there(call, pieces, monkeypatch):
     same("whole", "out")
 
 
+def test_blocks_that_hold_nothing_but_zeros_are_kept_as_well(call, pieces):
+    """One path has no spread, and the library leaves out chunks that hold only what they are filled with."""
+    pieces(3)
+    call(*RUN, "--paths", "1", "-o", "out", code=130)
+    pieces(-1)
+    call(*RUN, "--paths", "1", "-o", "out")
+    call(*RUN, "--paths", "1", "-o", "whole")
+    same("whole", "out")
+
+
 def test_a_full_disk_is_one_sentence_and_what_was_written_before_stays_valid(call, pieces, monkeypatch):
     pieces(-1)
     call(*RUN, "--paths", "4", "-o", "whole")

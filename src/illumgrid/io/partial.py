@@ -255,11 +255,14 @@ class Partial:
     def _write(self) -> None:
         if not self._new:
             return
+        import zarr
+
         remedy = "what it holds stays valid, and the same command goes on from there"
         with disk.sentences(f"{self.place} could not be written; the disk may be full", remedy):
             if self._group is None:
                 self._create()
-            with disk.held():
+            # A chunk of zeros is a file too: it is brought to the disk like the others.
+            with disk.held(), zarr.config.set({"array.write_empty_chunks": True}):
                 for paths in dict.fromkeys(p for p, _, _ in self._new):
                     some = [(rows, answer) for p, rows, answer in self._new if p == paths]
                     self._stored = self._add(paths, some) + (self._stored if paths == self._walked[-1] else 0)
