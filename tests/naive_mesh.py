@@ -61,8 +61,9 @@ def mesh_of(scene, levels, number):
     return MESHES[key][1]
 
 
-def first_hit(scene, levels, x, d, on=None):
-    """First hit of a ray over meshes: see `naive.first_hit`."""
+def first_hit(scene, levels, x, d, on=None, within=frozenset()):
+    """First hit of a ray over meshes, of which no field transmits: see `naive.first_hit`."""
+    assert not within
     x, d = np.array(x, float), np.array(d, float)
     walls = [naive.Wall(scene, k) for k in range(len(scene.quads))]
     hits = [wall.meet(x.tolist(), d.tolist()) for wall in walls if on is None or on.field != wall.number]

@@ -249,7 +249,7 @@ def test_a_path_that_starts_inside_another_solid_is_worth_nothing():
         key = np.uint64(7)
         start, light = (levels, 0, constants.NOWHERE, point, normal), np.ones(3)
         scenery = marchable(scene), NO_CACHE, constants.OFF_SWEEP
-        kernels.walk(*scenery, key, np.uint64(path), 4, *start, np.ones(3), light)
+        kernels.walk(*scenery, key, np.uint64(path), 4, *start, 0, np.ones(3), light)
         assert not light.any()
 
 

@@ -25,6 +25,7 @@ from illumgrid.field import levelset
 from illumgrid.field.levelset import isosurface, marchable
 from illumgrid.field.scene import Scene
 from illumgrid.field.volume import Volume
+from illumgrid.grid.cache import NO_CACHE
 from illumgrid.rng import stream
 from illumgrid.stages import on_level_sets
 from illumgrid.transport.samples import Queries, Samples, in_frame, join_queries
@@ -57,7 +58,15 @@ class Brute:
             surfaces = Casting(meshed(marchable(scene), Meshes(scene, bvh.build).of(row)), cast)
             target = queries.target[members].astype(np.int64)
             light, spread, good = answer(
-                surfaces, key[members], level[members], target, point[members], normal[members], paths, bounces
+                surfaces,
+                NO_CACHE,
+                key[members],
+                level[members],
+                target,
+                point[members],
+                normal[members],
+                paths,
+                bounces,
             )
             mean[members], m2[members], count[members] = light, spread, np.where(good, len(paths), 0)
         return Samples(queries, mean, m2, count)

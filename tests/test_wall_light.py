@@ -42,6 +42,7 @@ def test_texels_that_are_asked_for_lie_along_the_longest_edge_and_lamps_keep_the
     refused(lambda: with_texels(sky(), 8), "8 texels", "without walls")
 
 
+@pytest.mark.judged
 def test_the_command_line_takes_a_number_of_texels(call, refuse, tmp_path):
     said = call("run", "v.npy", "--range", "0.3", "0.9", "--scene", "floor", "--texels", "5", *QUICK, "-o", "out")
     assert ig.load(tmp_path / "out").walls[0].values.shape == (2, 5, 5, 3)
