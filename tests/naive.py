@@ -7,7 +7,7 @@ points. Points, directions and normals are lists of three floats in the frame of
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise, product
 
 import numpy as np
@@ -399,7 +399,7 @@ def behind_films(scene, levels, d, on, within, passes):
             break
         within ^= {hit.field}
         start = hit
-    return Hit(length, hit.field, hit.x, hit.normal, hit.cap)
+    return replace(hit, t=length)
 
 
 def first_hit(scene, levels, x, d, on=None, within=frozenset()):
