@@ -3,6 +3,7 @@
 import contextlib
 import hashlib
 import os
+import signal
 import time
 
 import numpy as np
@@ -21,6 +22,11 @@ except ImportError:  # on Windows every worker compiles
 
 # A judgement takes longer than the runs of most tests: those that are about it ask for it, or have the mark `judged`.
 chain.run.__kwdefaults__["judge"] = False
+
+# A shell ignores Ctrl-C for its background jobs, nohup SIGHUP, and a process takes over what is ignored.
+for stop, action in (("SIGINT", signal.default_int_handler), ("SIGHUP", signal.SIG_DFL)):
+    if hasattr(signal, stop) and signal.getsignal(getattr(signal, stop)) is signal.SIG_IGN:
+        signal.signal(getattr(signal, stop), action)
 
 
 @pytest.fixture

@@ -16,10 +16,10 @@ THREADS = 128
 
 def _tasks(loop):
     """The three tasks of a thread, in terms of the functions of the path loop."""
-    begin, buried, stream, place_in_sweep = loop.begin, loop.buried, loop.stream, loop.place_in_sweep
+    begin, shells_around, stream, place_in_sweep = loop.begin, loop.shells_around, loop.stream, loop.place_in_sweep
     walk, moments = loop.walk, loop.moments
 
-    def begin_one(i, scene, cache, asked, seed, start, face, place, key, paths, count):
+    def begin_one(i, scene, cache, asked, seed, start, face, within, place, key, paths, count):
         """Where the paths of query i begin; `paths` stays 0 for a hole."""
         point, normal = asked.point, asked.normal
         x, n = (point[i, 0], point[i, 1], point[i, 2]), (normal[i, 0], normal[i, 1], normal[i, 2])
@@ -27,12 +27,16 @@ def _tasks(loop):
             return
         own = np.int64(asked.target[i])
         x, at = begin(scene, own, x, n)
-        if at == LOST or buried(scene, asked.level[i], x, n, own):
+        around = shells_around(scene, asked.level[i], x, n, own)
+        if at == LOST or around < 0:
             return
+        within[i] = around
         start[i, 0], start[i, 1], start[i, 2], face[i] = x[0], x[1], x[2], at
         key[i], place[i], paths[i] = stream(seed, asked.id[i]), place_in_sweep(cache, asked.level[i]), count
 
-    def walk_one(i, scene, cache, asked, start, face, place, key, paths, first, bounces, throughput, own_worth, worth):
+    def walk_one(
+        i, scene, cache, asked, start, face, within, place, key, paths, first, bounces, throughput, own_worth, worth
+    ):
         """Path i of all queries in turn."""
         q, k = i // worth.shape[1], i % worth.shape[1]
         if paths[q] == 0:
@@ -41,7 +45,8 @@ def _tasks(loop):
         n = (asked.normal[q, 0], asked.normal[q, 1], asked.normal[q, 2])
         own, number = np.int64(asked.target[q]), np.uint64(first + k)
         walk(
-            scene, cache, place[q], key[q], number, bounces, asked.level[q], own, face[q], x, n, throughput, own_worth
+            scene, cache, place[q], key[q], number, bounces, asked.level[q], own, face[q], x, n, within[q],
+            throughput, own_worth,
         )  # fmt: skip
         for channel in range(own_worth.shape[0]):
             worth[q, k, channel] = own_worth[channel]
@@ -66,19 +71,20 @@ def _on_card(channels):
     begin_one, walk_one, judge_one = _tasks(functions("card"))
 
     @cuda.jit
-    def begin(scene, cache, asked, seed, start, face, place, key, paths, count):
+    def begin(scene, cache, asked, seed, start, face, within, place, key, paths, count):
         i = cuda.grid(1)
         if i < paths.shape[0]:
-            begin_one(i, scene, cache, asked, seed, start, face, place, key, paths, count)
+            begin_one(i, scene, cache, asked, seed, start, face, within, place, key, paths, count)
 
     @cuda.jit
-    def walk(scene, cache, asked, start, face, place, key, paths, first, bounces, worth):
+    def walk(scene, cache, asked, start, face, within, place, key, paths, first, bounces, worth):
         throughput = cuda.local.array(channels, np.float64)
         own_worth = cuda.local.array(channels, np.float64)
         i = cuda.grid(1)
         if i < worth.shape[0] * worth.shape[1]:
             walk_one(
-                i, scene, cache, asked, start, face, place, key, paths, first, bounces, throughput, own_worth, worth
+                i, scene, cache, asked, start, face, within, place, key, paths, first, bounces,
+                throughput, own_worth, worth,
             )  # fmt: skip
 
     @cuda.jit
@@ -101,16 +107,17 @@ def _on_processor():
     compiled = numba.njit(nogil=True, error_model="numpy")
 
     @compiled
-    def begin(count, scene, cache, asked, seed, start, face, place, key, paths, many):
+    def begin(count, scene, cache, asked, seed, start, face, within, place, key, paths, many):
         for i in range(count):
-            begin_one(i, scene, cache, asked, seed, start, face, place, key, paths, many)
+            begin_one(i, scene, cache, asked, seed, start, face, within, place, key, paths, many)
 
     @compiled
-    def walk(count, scene, cache, asked, start, face, place, key, paths, first, bounces, worth):
+    def walk(count, scene, cache, asked, start, face, within, place, key, paths, first, bounces, worth):
         throughput, own_worth = np.empty(worth.shape[2]), np.empty(worth.shape[2])
         for i in range(count):
             walk_one(
-                i, scene, cache, asked, start, face, place, key, paths, first, bounces, throughput, own_worth, worth
+                i, scene, cache, asked, start, face, within, place, key, paths, first, bounces,
+                throughput, own_worth, worth,
             )  # fmt: skip
 
     @compiled

@@ -67,17 +67,19 @@ class CudaTracer:
         if "scene" not in self._there:
             self._there["scene"] = type(self.fields)(*map(to, self.fields))
         if self._there.get("of") is not self.cache:
-            self._there.update(of=self.cache, cache=type(self.cache)(*map(to, self.cache)))
+            parts = (to(part) if isinstance(part, np.ndarray) else part for part in self.cache)
+            self._there.update(of=self.cache, cache=type(self.cache)(*parts))
         scene, cache = self._there["scene"], self._there["cache"]
         n, count, channels = len(asked.id), len(paths), len(self.channels)
         launch = launchers(self.backend.device, channels)
         asked = Asked(*map(to, asked))
-        start, face, place, key = new((n, 3), float), new(n, np.int64), new(n, float), new(n, np.uint64)
+        start, face, within = new((n, 3), float), new(n, np.int64), new(n, np.int64)
+        place, key = new(n, float), new(n, np.uint64)
         done, worth = to(np.zeros(n, np.int32)), new((n, count, channels), float)
         mean, m2 = to(np.zeros((n, channels), np.float32)), to(np.zeros((n, channels), np.float32))
-        launch.begin(n, scene, cache, asked, np.uint64(seed), start, face, place, key, done, count)
+        launch.begin(n, scene, cache, asked, np.uint64(seed), start, face, within, place, key, done, count)
         launch.walk(
-            n * count, scene, cache, asked, start, face, place, key, done, paths.start, bounces, worth
+            n * count, scene, cache, asked, start, face, within, place, key, done, paths.start, bounces, worth
         )  # fmt: skip
         launch.judge(n * channels, scene, done, paths.start, worth, mean, m2)
         return back(mean), back(m2), back(done)

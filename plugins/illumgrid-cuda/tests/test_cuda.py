@@ -81,15 +81,17 @@ def test_without_a_card_it_is_refused_by_name_with_the_reason():
 
 def has_compiler():
     try:
+        from cuda.pathfinder import load_nvidia_dynamic_lib
         from numba.cuda.cudadrv.nvvm import NVVM
 
         NVVM()
+        load_nvidia_dynamic_lib("nvrtc")
     except Exception:
         return False
     return True
 
 
-@pytest.mark.skipif(not has_compiler(), reason="no libnvvm here: pip install 'illumgrid-cuda[cu12]'")
+@pytest.mark.skipif(not has_compiler(), reason="no libnvvm and libnvrtc here: pip install 'illumgrid-cuda[cu12]'")
 def test_the_kernels_compile_for_a_card_that_is_not_there(monkeypatch):
     import numba.cuda.dispatcher
     from illumgrid_cuda.kernels import launchers
@@ -107,13 +109,15 @@ def test_the_kernels_compile_for_a_card_that_is_not_there(monkeypatch):
         return types.Array({"bool": types.boolean}.get(str(kind)) or getattr(types, str(kind)), axes, "C")
 
     def together(arrays):
-        return types.NamedTuple([array(a.dtype, a.ndim) for a in arrays], type(arrays))
+        parts = [array(a.dtype, a.ndim) if isinstance(a, np.ndarray) else types.int64 for a in arrays]
+        return types.NamedTuple(parts, type(arrays))
 
     values = np.arange(27, dtype=np.float32).reshape(3, 3, 3)
     channels, fields = laid_out(ig.Scene.sky(ig.Volume(values), range=(5, 20)))
     asked = Asked(np.zeros(1, np.uint64), *np.zeros((2, 1, 3)), np.zeros((1, 1)), np.zeros(1, np.int64))
     scene, cache, asked, whole = together(fields), together(NO_CACHE), together(asked), types.int64
-    begun = array("float64", 2), array("int64", 1), array("float64", 1), array("uint64", 1), array("int32", 1)
+    begun = array("float64", 2), array("int64", 1), array("int64", 1), array("float64", 1), array("uint64", 1)
+    begun = *begun, array("int32", 1)
     worth, light = array("float64", 3), array("float32", 2)
     begin, walk, judge = launchers("card", len(channels)).kernels
     for kernel, arguments in (
