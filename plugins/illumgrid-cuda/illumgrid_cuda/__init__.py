@@ -37,7 +37,7 @@ class Cuda:
             reason = str(getattr(cuda.cuda_error(), "msg", None) or cuda.cuda_error() or "no card was found")
         except Exception as problem:
             reason = str(problem) or type(problem).__name__
-        return f"install an NVIDIA card with its driver ({' '.join(reason.split())[:100]})"
+        return f"install an NVIDIA card with its driver ({' '.join(reason.split()).partition('. ')[0][:100]})"
 
     def prepare(self, scene):
         """Lay the fields out and take them to the device, once."""
