@@ -140,7 +140,7 @@ def test_what_was_noted_during_a_run_is_kept_and_shown_again(call, tmp_path):
         (("v.npy", "--inside", "left"), ["--inside", "'left'", "above or below"]),
         (("v.npy", "--albedo", "1", "2", "3"), ["albedo", "0 to 1"]),
         (("v.npy", "--sampler", "unifrom"), ["sampler", "did you mean 'uniform'?"]),
-        (("v.npy", "--backend", "cuda"), ["backend", "'cuda'", "numba"]),
+        (("v.npy", "--backend", "metal"), ["backend", "'metal'", "numba"]),
         (("v.npy", "--interpolator", "nearst"), ["did you mean 'nearest'?"]),
         (("v.npy", "--set", "sampler.count=3"), ["'direct'", "no option 'count'"]),
         (("v.npy", "--set", "sampler"), ["--set", "'sampler'", "STAGE.OPTION=VALUE"]),
