@@ -5,8 +5,7 @@ from typing import Any
 import numpy as np
 
 from illumgrid.field.layers import SKY
-from illumgrid.field.lights import Distant, Harmonics, projected
-from illumgrid.field.lights import Sky as SkyLight
+from illumgrid.field.lights import Distant, Harmonics, Sky, projected
 from illumgrid.field.upright import sky_axes
 from illumgrid.light import Illumination
 
@@ -23,7 +22,7 @@ def described(light: Illumination, names: list[str]) -> dict[str, Any] | None:
     scene = light.scene
     materials = [field.material for field in scene.fields]
     held = any(field.isovalue is not None for field in scene.fields)
-    images = any(isinstance(one, SkyLight) and one.radiance.ndim == 3 for one in scene.lights)
+    images = any(isinstance(one, Sky) and one.radiance.ndim == 3 for one in scene.lights)
     special = any(m.emission.any() or m.transmission for m in materials)
     if images or special or held or len(scene.fields) + len(scene.quads) > MOST_SURFACES:
         return None
@@ -34,7 +33,7 @@ def described(light: Illumination, names: list[str]) -> dict[str, Any] | None:
 
     axes = sky_axes(scene)
     skies, discs, lamps = [], [], []
-    for one in (SkyLight(SKY, scene.background), *scene.lights):
+    for one in (Sky(SKY, scene.background), *scene.lights):
         number, share = weighed(one.name)
         if isinstance(one, Distant):
             cosine = float(np.cos(np.radians(one.angle)))
