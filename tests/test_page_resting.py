@@ -46,7 +46,7 @@ def test_rays_take_away_what_the_lookup_is_off(browser, kind):  # noqa: F811
     inner = binary_erosion(covered, iterations=2)  # outlines are sampled at other places
     before, now, truth = (decode_srgb(x[inner].astype(np.uint8)) for x in (looked_up, at_rest(browser, RAYS), wanted))
     off = np.sqrt(np.square(now - truth).mean()), np.sqrt(np.square(before - truth).mean())
-    # By theory sqrt(N0 / (N0 + N)) is left: 0.58 where the lookup is worth the fewest rays, 4, and more on the box's walls.
+    # By theory sqrt(N0 / (N0 + N)) is left: 0.58 where a lookup is worth the fewest rays, 4, and more on walls.
     assert off[0] < {"studio": 0.58, "box": 0.8}[kind] * off[1]
     noise = np.sqrt(np.square(now - truth).mean() / len(truth))
     kept = 0.8 * abs(before.mean() - truth.mean())  # of what the lookup is off, which counts as some rays
