@@ -14,7 +14,7 @@ import illumgrid as ig
 from illumgrid.show import render
 
 volume, limits, source = brain()
-light = ig.run(ig.Scene.sky(volume, albedo=(0.8, 0.66, 0.6), range=limits), paths=24)
+light = ig.run(ig.Scene.studio(volume, albedo=(0.8, 0.66, 0.6), range=limits), paths=24)
 
 # %%
 # **What to look for:** the clefts between the hemispheres and above the temple are the deepest. In the left picture
