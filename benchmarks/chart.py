@@ -38,7 +38,7 @@ from illumgrid.accuracy.choose import planned
 from illumgrid.accuracy.judge import judge
 from illumgrid.accuracy.points import unseen_in_volume, unseen_on_level_sets
 from illumgrid.accuracy.reference import begin, converge, errors, look_up
-from illumgrid.bake import Bake
+from illumgrid.bake.accumulator import Bake
 from illumgrid.cli.report import files
 from illumgrid.field.scene import level_table
 from illumgrid.field.volume import smooth

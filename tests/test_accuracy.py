@@ -12,7 +12,7 @@ from illumgrid.accuracy.points import other_paths, unseen_in_volume, unseen_on_l
 from illumgrid.accuracy.probe import Measured, Probe
 from illumgrid.accuracy.reference import Reference, begin, converge, errors, look_up
 from illumgrid.backends.numba_ import Numba
-from illumgrid.bake import Bake
+from illumgrid.bake.accumulator import Bake
 from illumgrid.chain import rounds
 from illumgrid.field.lattice import specs_over
 from illumgrid.field.scene import Scene, level_table

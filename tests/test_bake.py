@@ -13,10 +13,12 @@ import illumgrid as ig
 from illumgrid.accuracy.chart.contestants import Method
 from illumgrid.accuracy.chart.race import Run
 from illumgrid.backends.numba_ import Numba
-from illumgrid.bake import Bake, shifted_seed, wall_queries
+from illumgrid.bake.accumulator import Bake
+from illumgrid.bake.targets import wall_queries
 from illumgrid.field.scene import Scene, level_table
 from illumgrid.grid import GridSpec
 from illumgrid.interpolators.nearest import Nearest
+from illumgrid.rng import shifted_seed
 from illumgrid.samplers.direct import Direct
 from illumgrid.transport.samples import Samples, join_queries
 from illumgrid.transport.tracer import prepare

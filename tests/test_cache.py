@@ -10,7 +10,8 @@ import illumgrid as ig
 import naive
 from illumgrid.backends.numba_ import Numba
 from illumgrid.backends.reference import Reference
-from illumgrid.bake import MOST_BIAS, enough_bounces, light_known_first
+from illumgrid.bake.bounces import enough_bounces
+from illumgrid.bake.known import MOST_BIAS, light_known_first
 from illumgrid.errors import BadInput
 from illumgrid.field.lattice import specs_over
 from illumgrid.field.scene import Scene, level_table

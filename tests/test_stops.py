@@ -13,7 +13,8 @@ import pytest
 from illumgrid import cli
 from illumgrid.backends.mesh import bvh
 from illumgrid.backends.numba_ import Numba
-from illumgrid.bake import Bake, wall_queries
+from illumgrid.bake.accumulator import Bake
+from illumgrid.bake.targets import wall_queries
 from illumgrid.field.scene import Scene, level_table
 from illumgrid.io import disk
 from illumgrid.transport.tracer import prepare

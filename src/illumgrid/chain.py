@@ -15,7 +15,10 @@ from illumgrid.accuracy.choose import JUDGED, Plan, planned
 from illumgrid.accuracy.judge import judge as measure_error
 from illumgrid.accuracy.judge import judge_walls as measure_walls
 from illumgrid.accuracy.probe import FEWEST_PATHS, MOST_PATHS
-from illumgrid.bake import Baked, Map, Progress, bake, enough_bounces, light_known_first, light_left_out
+from illumgrid.bake import Baked, bake
+from illumgrid.bake.accumulator import Map, Progress
+from illumgrid.bake.bounces import enough_bounces, light_left_out
+from illumgrid.bake.known import light_known_first
 from illumgrid.constants import PATHS
 from illumgrid.errors import BadInput, tell, tell_after
 from illumgrid.field.lattice import specs_over
@@ -80,7 +83,7 @@ def run(
     bounces : int, optional
         Reflections; 0 is light straight from background and lamps. By default as many as leave out less than 1 % of
         the light, and at least 4; where it takes more, a coarse grid is lit first, and paths end in its light where
-        that is known well: see `illumgrid.bake.light_known_first`. A number given here is followed path by path.
+        that is known well: see `illumgrid.bake.known.light_known_first`. A number given here is followed path by path.
     isovalues : int, optional
         Rows of the level table, 32 by default; if given, also the count of a sampler that is named and has one.
     seed : int

@@ -114,3 +114,8 @@ def sharing(along, across):  # type: ignore[no-untyped-def]
     for _ in range(across):
         mask ^= mask << 1
     return mask << along
+
+
+def shifted_seed(seed: int, shift: int) -> int:
+    """Another seed, `shift` further on, within the 64 bits that a seed has."""
+    return (seed + shift) % 2**64

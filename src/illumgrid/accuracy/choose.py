@@ -8,9 +8,10 @@ import numpy as np
 
 from illumgrid.accuracy.cost import Pace, measure_pace
 from illumgrid.accuracy.probe import FEWEST_PATHS, MOST_PATHS, Measured, Probe
-from illumgrid.bake import shifted_seed, texel_paths, wall_queries
+from illumgrid.bake.targets import texel_paths, wall_queries
 from illumgrid.field.lattice import specs_over
 from illumgrid.field.scene import Levels, Scene
+from illumgrid.rng import shifted_seed
 from illumgrid.transport.tracer import Tracer
 
 SHARE = 0.25  # of the asked error that the bounces left out may be

@@ -10,12 +10,12 @@ from illumgrid.accuracy.points import unseen_in_volume
 from illumgrid.accuracy.probe import Probe
 from illumgrid.accuracy.reference import Errors, Reference, begin, enough, errors, look_up
 from illumgrid.accuracy.walls import look_up_walls, unseen_on_walls
-from illumgrid.bake import shifted_seed
 from illumgrid.errors import BadInput
 from illumgrid.field.lattice import specs_over
 from illumgrid.field.scene import Scene
 from illumgrid.field.volume import smooth
 from illumgrid.grid import GridSpec, IlluminationGrid, WallTexture
+from illumgrid.rng import shifted_seed
 from illumgrid.stages import Backend
 from illumgrid.transport.samples import Queries
 from illumgrid.transport.tracer import Tracer, prepare

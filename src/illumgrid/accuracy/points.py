@@ -3,9 +3,9 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from illumgrid.bake import shifted_seed
 from illumgrid.field.scene import Field, Scene
 from illumgrid.field.volume import AT_ONCE, Floats, cell_gradient, index_to_world, interpolate
+from illumgrid.rng import shifted_seed
 from illumgrid.stages import on_level_sets
 from illumgrid.transport.samples import Queries, join_queries
 

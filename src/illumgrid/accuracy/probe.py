@@ -13,10 +13,11 @@ import numpy as np
 from illumgrid.accuracy.parts import Parts, missing, parts_of
 from illumgrid.accuracy.points import unseen_in_volume
 from illumgrid.accuracy.reference import Reference, begin, converge, enough
-from illumgrid.bake import Bake, shifted_seed
+from illumgrid.bake.accumulator import Bake
 from illumgrid.errors import BadInput
 from illumgrid.field.scene import Scene
 from illumgrid.grid import GridSpec
+from illumgrid.rng import shifted_seed
 from illumgrid.samplers.direct import corners
 from illumgrid.transport.tracer import Tracer
 

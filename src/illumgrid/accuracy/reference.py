@@ -7,10 +7,12 @@ from typing import Any
 import numpy as np
 
 from illumgrid.accuracy.points import other_paths
-from illumgrid.bake import Bake, light_left_out, shifted_seed
+from illumgrid.bake.accumulator import Bake
+from illumgrid.bake.bounces import light_left_out
 from illumgrid.field.scene import Scene
 from illumgrid.field.volume import Floats
 from illumgrid.grid import IlluminationGrid
+from illumgrid.rng import shifted_seed
 from illumgrid.transport.samples import Queries
 from illumgrid.transport.tracer import Tracer
 

@@ -13,7 +13,7 @@ import typer
 from illumgrid.errors import WARNINGS, BadInput, IllumgridWarning
 
 if TYPE_CHECKING:
-    from illumgrid.bake import Progress
+    from illumgrid.bake.accumulator import Progress
 
 INTERVAL = 10.0  # seconds between two lines of progress where there is no terminal to draw a bar on
 

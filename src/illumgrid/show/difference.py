@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from illumgrid.bake import shifted_seed
 from illumgrid.field.scene import Scene, level_table
 from illumgrid.field.volume import Floats
 from illumgrid.grid import IlluminationGrid, WallTexture
 from illumgrid.light import Illumination
+from illumgrid.rng import shifted_seed
 from illumgrid.show import render
 from illumgrid.show.engines.software import SIDE
 from illumgrid.transport.samples import Queries

@@ -14,10 +14,12 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from illumgrid.bake import Progress, enough_bounces, shifted_seed
+from illumgrid.bake.accumulator import Progress
+from illumgrid.bake.bounces import enough_bounces
 from illumgrid.errors import BadInput
 from illumgrid.field.volume import Floats
 from illumgrid.light import Illumination
+from illumgrid.rng import shifted_seed
 from illumgrid.show.camera import Camera
 from illumgrid.show.engines import software
 from illumgrid.show.engines.software import SIDE, Hits

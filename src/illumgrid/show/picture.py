@@ -8,7 +8,7 @@ from importlib.metadata import version
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from illumgrid.bake import Progress
+from illumgrid.bake.accumulator import Progress
 from illumgrid.errors import BadInput
 from illumgrid.field.upright import axes_of, up_of
 from illumgrid.field.volume import box_corners

@@ -13,12 +13,14 @@ from illumgrid.accuracy.cost import measure_pace
 from illumgrid.accuracy.points import unseen_on_level_sets
 from illumgrid.accuracy.probe import Measured, Probe
 from illumgrid.accuracy.reference import Reference, begin, converge, enough
-from illumgrid.bake import Progress, light_left_out, shifted_seed
+from illumgrid.bake.accumulator import Progress
+from illumgrid.bake.bounces import light_left_out
 from illumgrid.constants import PATHS
 from illumgrid.errors import BadInput
 from illumgrid.field.lattice import specs_over
 from illumgrid.field.scene import Scene
 from illumgrid.grid.nodes import reachable
+from illumgrid.rng import shifted_seed
 from illumgrid.samplers.direct import Direct
 from illumgrid.transport.samples import Queries
 from illumgrid.transport.tracer import Tracer, prepare

@@ -10,12 +10,14 @@ from numpy.typing import NDArray
 
 from illumgrid.accuracy.chart.contestants import COUNTS, Method
 from illumgrid.accuracy.reference import Reference, errors, look_up
-from illumgrid.bake import Bake, of_field, shifted_seed
+from illumgrid.bake.accumulator import Bake
+from illumgrid.bake.targets import of_field
 from illumgrid.errors import BadInput
 from illumgrid.field.lattice import specs_over
 from illumgrid.field.scene import Scene
 from illumgrid.field.volume import Floats
 from illumgrid.grid import GridSpec, IlluminationGrid, Nodes
+from illumgrid.rng import shifted_seed
 from illumgrid.samplers.direct import corners
 from illumgrid.stages import Interpolator
 from illumgrid.transport.samples import Queries

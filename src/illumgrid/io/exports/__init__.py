@@ -12,7 +12,7 @@ from illumgrid.io.exports import arrays, surface, vti
 from illumgrid.io.readers.mesh import read_mesh
 
 if TYPE_CHECKING:
-    from illumgrid.bake import Progress
+    from illumgrid.bake.accumulator import Progress
     from illumgrid.light import Illumination
 
 LATTICES = {".vti": vti.write, ".nrrd": arrays.write_nrrd, ".exr": arrays.write_exr, ".npz": arrays.write_npz}

@@ -15,7 +15,7 @@ from illumgrid.field.volume import Floats, Lattice, Volume, index_to_world, inte
 from illumgrid.tone import curve, encode_srgb
 
 if TYPE_CHECKING:
-    from illumgrid.bake import Progress
+    from illumgrid.bake.accumulator import Progress
     from illumgrid.light import Illumination
 
 NAMES = ("irradiance", "error", "support", "field", "color")

@@ -19,7 +19,7 @@ from illumgrid.tone import decode_srgb, encode_srgb
 if TYPE_CHECKING:
     import trimesh
 
-    from illumgrid.bake import Progress
+    from illumgrid.bake.accumulator import Progress
     from illumgrid.light import Illumination
 
 

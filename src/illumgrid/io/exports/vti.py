@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 from illumgrid.io.exports.arrays import Points
 
 if TYPE_CHECKING:
-    from illumgrid.bake import Progress
+    from illumgrid.bake.accumulator import Progress
 
 _BLOCK = 1 << 18
 """Bytes that are packed together."""

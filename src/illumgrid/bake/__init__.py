@@ -1,0 +1,170 @@
+"""The chain: ask, answer, combine, fill. No disk, no names of stages, no screen."""
+
+import time
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from illumgrid.bake.accumulator import Bake, Map, Progress
+from illumgrid.bake.targets import HELD_ROWS, coarse_first, held_queries, of_field, texel_paths, wall_queries
+from illumgrid.field.scene import Levels, Quad, Scene
+from illumgrid.field.volume import interpolate, world_to_index
+from illumgrid.grid import GridSpec, IlluminationGrid, Nodes, WallTexture, fill_holes
+from illumgrid.grid.nodes import reachable
+from illumgrid.grid.walls import calmed
+from illumgrid.stages import Interpolator, Sampler
+from illumgrid.transport.samples import Samples
+from illumgrid.transport.stages import fill_nodes
+from illumgrid.transport.tracer import Tracer
+from illumgrid.transport.walk import Keeper, in_order
+
+
+@dataclass(frozen=True, eq=False)
+class Baked:
+    """Light for every field, and how it came about.
+
+    Parameters
+    ----------
+    grids : tuple of IlluminationGrid
+        One a field.
+    walls : tuple of WallTexture
+        One a quad.
+    seconds : dict
+        Wall time of each stage.
+    queries : int
+        Number of queries answered, texels among them.
+    paths : int
+        Paths walked from each of a field's.
+    texels, texel_paths : int
+        Queries on walls, and paths walked from each.
+    holes : tuple of int
+        For each field, nodes that its isosurfaces can show and no sample supports.
+    """
+
+    grids: tuple[IlluminationGrid, ...]
+    walls: tuple[WallTexture, ...]
+    seconds: dict[str, float]
+    queries: int
+    paths: int
+    texels: int
+    texel_paths: int
+    holes: tuple[int, ...]
+
+
+def wall_texture(rows: int, quad: Quad, answer: Samples) -> WallTexture:
+    """The texture of a quad from the samples at its texels, for so many rows of levels; its noise is calmed."""
+    nu, nv = quad.texels
+    support = (answer.paths > 0).astype(np.float32).reshape(rows, nv, nu)
+    texel = np.linalg.norm(quad.edge_v) / nv, np.linalg.norm(quad.edge_u) / nu
+    # Another row is another setting of the sweep: look there last.
+    spacing = (1e3 * max(texel) * max(nu, nv), *texel)
+    shape = rows, nv, nu
+    calm = calmed(
+        answer.light.reshape(*shape, -1), answer.mean.reshape(*shape, 3), answer.error.reshape(shape), support
+    )
+    light = fill_holes(spacing, calm, support)
+    return WallTexture(light, support, answer.channels)
+
+
+def holes_within_range(scene: Scene, field: int, grid: IlluminationGrid) -> int:
+    """Nodes without support through which an isosurface of the range passes, outside the solids of other fields."""
+    own = scene.fields[field]
+    near = reachable(own, grid.spec)
+    empty = near[grid.support.reshape(-1)[near] == 0]
+    nodes = grid.spec.nodes(empty)
+    level = interpolate(own.volume, world_to_index(own.volume, nodes))
+    seen = (level >= own.range[0]) & (level <= own.range[1])
+    for number, other in enumerate(scene.fields):
+        if number != field:
+            index = world_to_index(other.volume, nodes)
+            within = ((index >= 0) & (index <= np.array(other.volume.shape) - 1)).all(axis=1)
+            value = interpolate(other.volume, index)
+            seen &= ~(within & other.solid(value, scene.levels_through(field, level)[:, number]))
+    return int(seen.sum())
+
+
+def bake(
+    scene: Scene,
+    specs: Sequence[GridSpec],
+    levels: Levels,
+    sampler: Sampler,
+    tracer: Tracer,
+    interpolator: Interpolator,
+    *,
+    paths: Iterable[range],
+    bounces: int,
+    seed: int = 0,
+    map: Map = map,
+    progress: Progress = lambda what, done, total: None,
+    keep: Keeper | None = None,
+) -> Baked:
+    """Compute the illumination grids of a scene, and the light of its walls.
+
+    Parameters
+    ----------
+    scene : Scene
+    specs : sequence of GridSpec
+        The nodes, one lattice a field.
+    levels : Levels
+        Rows of the sweep at which the walls are lit.
+    sampler, interpolator
+        Stage objects.
+    tracer : Tracer
+        A backend with the scene set up: `illumgrid.transport.tracer.prepare`.
+    paths : iterable of range
+        Numbers of the paths from every node, one range after the other; the next is asked for when one is walked.
+        A texel has `texel_paths` times as many.
+    bounces : int
+    seed : int
+    map : callable, optional
+        What spreads the batches: the built-in ``map``, or that of an executor or cluster.
+    progress : callable, optional
+        Called with (what, done, total).
+    keep : Keeper, optional
+        Keeps the light as it is computed, from coarse to fine, and knows that of a run that was stopped.
+    """
+    clock = [time.perf_counter()]
+    nodes = [batch for batch in sampler.queries(scene, specs, seed) if len(batch)]
+    texels = wall_queries(scene, levels)
+    asked, on_walls = (sum(len(batch) for batch in batches) for batches in (nodes, texels))
+    more = texel_paths(asked, on_walls)
+    held, count = held_queries(scene, nodes), len(nodes)
+    state = Bake((*nodes, *held, *texels), (1,) * (count + len(held)) + (more,) * len(texels), bounces, seed)
+    del nodes, texels
+    clock.append(time.perf_counter())
+    ranks = None if keep is None else [coarse_first(scene, specs, levels, batch) for batch in state.targets]
+    if keep is not None and ranks:
+        keep.begin(state.targets, in_order(ranks))
+    for numbers in paths:
+        state = state.walk(tracer, numbers, map, progress, keep, ranks)
+    if keep is not None and state.answers:
+        keep.end(state.answers)
+    clock.append(time.perf_counter())
+
+    grids, walked = [], state.paths
+    rows = list(state.answers[count : count + len(held)])
+    answers = [*state.answers[:count], *state.answers[count + len(held) :]]
+    del state, held
+    for number, spec in enumerate(specs):
+        samples = of_field(scene, answers, number)
+        answers = [a for a in answers if (a.queries.target > number).any()]  # a large run is held once, not twice
+        nodes_of = Nodes(spec, scene.fields[number], number)
+        grids.append(fill_nodes(interpolator, samples, nodes_of))
+        if scene.fields[number].isovalue is not None:
+            lit = tuple(fill_nodes(interpolator, rows.pop(0), nodes_of) for _ in range(HELD_ROWS))
+            grids[-1] = replace(grids[-1], values=grids[-1].light, rows=lit)
+        del samples
+        progress("grid", number + 1, len(specs))
+    walls = [wall_texture(len(levels.table), quad, answer) for quad, answer in zip(scene.quads, answers)]
+    clock.append(time.perf_counter())
+    return Baked(
+        grids=tuple(grids),
+        walls=tuple(walls),
+        seconds=dict(zip(("sampler", "backend", "interpolator"), np.diff(clock).tolist())),
+        queries=asked + on_walls,
+        paths=walked,
+        texels=on_walls,
+        texel_paths=more * walked,
+        holes=tuple(holes_within_range(scene, n, grid) for n, grid in enumerate(grids)),
+    )

@@ -1,0 +1,85 @@
+"""What is asked beside the nodes, in which order, and whose answer is whose: texels of walls, levels that are held."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from illumgrid.field.scene import Levels, Scene
+from illumgrid.field.volume import world_to_index
+from illumgrid.grid import GridSpec, channels_of
+from illumgrid.transport.samples import Queries, Samples, join_queries, join_samples
+
+HELD_ROWS = 5
+"""Places of the sweep, its ends among them, at which a level that is held is lit."""
+
+
+def wall_queries(scene: Scene, levels: Levels) -> list[Queries]:
+    """Queries at the middles of the texels of every quad's front, for every row of levels: one batch a quad."""
+    batches = []
+    for number, quad in enumerate(scene.quads, len(scene.fields)):
+        nu, nv = quad.texels
+        rows, v, u = np.indices((len(levels.table), nv, nu)).reshape(3, -1)
+        point = quad.corner + ((u + 0.5) / nu)[:, None] * quad.edge_u + ((v + 0.5) / nv)[:, None] * quad.edge_v
+        batches.append(
+            Queries(
+                id=np.arange(len(rows), dtype=np.uint64) | np.uint64(number << 40),
+                point=point,
+                normal=np.tile(quad.normal, (len(rows), 1)),
+                level=levels.table[rows],
+                target=np.full(len(rows), number, np.int32),
+            )
+        )
+    return batches
+
+
+def held_queries(scene: Scene, nodes: Sequence[Queries]) -> list[Queries]:
+    """Queries at the nodes of each field whose level is held, with the others at `HELD_ROWS` places of the sweep.
+
+    One batch a field and place, place after place.
+    """
+    batches = []
+    for number, field in enumerate(scene.fields):
+        if field.isovalue is None:
+            continue
+        own = [batch[batch.target == number] for batch in nodes if (batch.target == number).any()]
+        asked = join_queries(own) if own else Queries.at(scene, np.zeros((0, 3)), number)
+        for row, level in enumerate(scene.levels(np.linspace(0.0, 1.0, HELD_ROWS))):
+            levels = np.tile(level, (len(asked), 1))
+            levels[:, number] = asked.level[:, number]
+            ids = asked.id | np.uint64(row + 1) << np.uint64(56)
+            batches.append(Queries(ids, asked.point, asked.normal, levels, asked.target))
+    return batches
+
+
+def coarse_first(scene: Scene, specs: Sequence[GridSpec], levels: Levels, queries: Queries) -> NDArray[np.int8]:
+    """Ranks (n,) of targets: 0 for every fourth node or texel along each axis, 1 for every second, 2 for the others."""
+    index = np.zeros((len(queries), 3), np.int64)
+    for target in np.unique(queries.target):
+        own = queries.target == target
+        if target < len(specs):
+            index[own] = np.round(world_to_index(specs[target], queries.point[own]))
+        else:
+            nu, nv = scene.quads[target - len(specs)].texels
+            number = (queries.id[own] & np.uint64((1 << 40) - 1)).astype(np.int64)
+            index[own] = np.stack(np.unravel_index(number, (len(levels.table), nv, nu)), axis=1)
+    even, fourth = ((index % step == 0).all(axis=1).astype(np.int8) for step in (2, 4))
+    return np.asarray(2 - even - fourth, np.int8)
+
+
+def texel_paths(nodes: int, texels: int) -> int:
+    """Paths from a texel for each from a node: up to eight, while the walls are no more work than the grids.
+
+    A texel is seen across many pixels, where noise that a curved surface hides shows as blotches.
+    """
+    return int(np.clip(nodes // max(texels, 1), 1, 8))
+
+
+def of_field(scene: Scene, answers: Sequence[Samples], number: int) -> Samples:
+    """Samples of one field; a batch may hold several fields, and a field may have none."""
+    own = [a if (a.queries.target == number).all() else a[a.queries.target == number] for a in answers]
+    if own := [a for a in own if len(a)]:
+        return join_samples(own)
+    channels = channels_of(scene)
+    none = np.zeros((0, len(channels)), np.float32)
+    return Samples(Queries.at(scene, np.zeros((0, 3))), none, none, np.zeros(0, np.int32), channels)
