@@ -1,15 +1,15 @@
 """``illumgrid bench``: the speed-accuracy chart on the user's own data."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-from illumgrid.cli.reading import Array, Channel, Crop, Downsample, Follow, Label, Spacing, Time
-from illumgrid.cli.reading import given as as_given
+from illumgrid.cli.reading import NONE, with_reading
 from illumgrid.cli.terminal import progress_bars, reported_warnings, result, say
 
 
+@with_reading
 def bench(
     source: Annotated[
         str | None,
@@ -23,14 +23,7 @@ def bench(
     output: Annotated[
         Path | None, typer.Option("--output", "-o", metavar="DIR", help="Where the chart goes. [default: INPUT-bench]")
     ] = None,
-    spacing: Spacing = None,
-    channel: Channel = None,
-    time_step: Time = None,
-    array: Array = None,
-    label: Label = None,
-    crop: Crop = None,
-    downsample: Downsample = None,
-    follow: Follow = False,
+    reading: dict[str, Any] = NONE,
     smooth: Annotated[
         float | None, typer.Option(min=0.0, metavar="SIGMA", help="Gaussian blur in voxels before anything else.")
     ] = None,
@@ -44,21 +37,11 @@ def bench(
     """
     from illumgrid.accuracy.chart import bench as race
     from illumgrid.cli.report import files
-    from illumgrid.cli.run import scene_input
+    from illumgrid.cli.scenes import scene_input
     from illumgrid.constants import PATHS
     from illumgrid.io import disk
     from illumgrid.show.difference import studio
 
-    reading = as_given(
-        spacing=spacing,
-        channel=channel,
-        time=time_step,
-        array=array,
-        label=label,
-        crop=crop,
-        downsample=downsample,
-        follow=follow or None,
-    )
     given = scene_input(source, None, limits, None, False, None, reading)
     folder = output or Path(f"{given.name}-bench")
     disk.claim_new(folder)

@@ -5,19 +5,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from illumgrid.cli.reading import (
-    Array,
-    Channel,
-    Crop,
-    Downsample,
-    Follow,
-    Label,
-    Spacing,
-    Time,
-    check_inside,
-    given,
-    labels_of,
-)
+from illumgrid.cli.reading import NONE, check_inside, given, labels_of, with_reading
 from illumgrid.cli.terminal import Ignore, omitted_light, reported_warnings, result
 
 if TYPE_CHECKING:
@@ -43,6 +31,7 @@ def histogram_line(counts: "Sequence[int]") -> str:
     return "".join(marks[int(np.ceil(h * 8))] for h in height)
 
 
+@with_reading
 def info(
     source: Annotated[
         str, typer.Argument(metavar="DIR|VOLUME", help="A finished run, a volume file or a DICOM folder.")
@@ -56,31 +45,14 @@ def info(
     inside: Annotated[
         str | None, typer.Option(help="Which side of the isovalue is solid: above, below. [default: above]")
     ] = None,
-    spacing: Spacing = None,
-    channel: Channel = None,
-    time: Time = None,
-    array: Array = None,
-    label: Label = None,
-    crop: Crop = None,
-    downsample: Downsample = None,
-    follow: Follow = False,
+    reading: dict[str, Any] = NONE,
     ignore: Ignore = None,
 ) -> None:
     """Describe a volume or a finished run; for a volume, suggest a range and warn of what will limit the result."""
     from illumgrid.errors import BadInput
     from illumgrid.io import store
 
-    check_inside(inside, label)
-    reading = given(
-        spacing=spacing,
-        channel=channel,
-        time=time,
-        array=array,
-        label=label,
-        crop=crop,
-        downsample=downsample,
-        follow=follow or None,
-    )
+    check_inside(inside, reading.get("label"))
     with reported_warnings(ignore):
         if not store.is_run(source):
             _describe_volume(source, limits, "below" if inside == "below" else "above", reading)

@@ -1,36 +1,68 @@
 """Options that add what a volume file does not say, or choose a part of it."""
 
+import inspect
+from collections.abc import Callable
+from functools import wraps
+from inspect import Parameter
 from typing import Annotated, Any
 
 import typer
 
 from illumgrid.errors import BadInput
 
-Spacing = Annotated[
-    tuple[float, float, float] | None,
-    typer.Option("--spacing", metavar="X Y Z", help="Distances between voxels. [default: those of the file]"),
-]
-Channel = Annotated[
-    str | None, typer.Option("--channel", metavar="N", help="Which channel of the file: number, from 0, or name.")
-]
-Time = Annotated[str | None, typer.Option("--time", metavar="N", help="Which time step of the file, from 0.")]
-Array = Annotated[
-    str | None, typer.Option("--array", metavar="NAME", help="Which array of the file: name, or number from 0.")
-]
-Label = Annotated[
-    str | None,
-    typer.Option("--label", metavar="N[,N…]", help="The file is a label map: smooth surfaces of these labels."),
-]
-Crop = Annotated[
-    tuple[int, int, int, int, int, int] | None,
-    typer.Option("--crop", metavar="A B C D E F", help="Only voxels A to B - 1 along x, C to D - 1, E to F - 1."),
-]
-Downsample = Annotated[
-    int | None, typer.Option("--downsample", min=1, metavar="N", help="Means over blocks of N x N x N voxels.")
-]
-Follow = Annotated[
-    bool, typer.Option("--follow", help="Read data files outside the folder of the header that names them.")
-]
+OPTIONS: dict[str, Any] = {
+    "spacing": Annotated[
+        tuple[float, float, float] | None,
+        typer.Option("--spacing", metavar="X Y Z", help="Distances between voxels. [default: those of the file]"),
+    ],
+    "channel": Annotated[
+        str | None, typer.Option("--channel", metavar="N", help="Which channel of the file: number, from 0, or name.")
+    ],
+    "time": Annotated[str | None, typer.Option("--time", metavar="N", help="Which time step of the file, from 0.")],
+    "array": Annotated[
+        str | None, typer.Option("--array", metavar="NAME", help="Which array of the file: name, or number from 0.")
+    ],
+    "label": Annotated[
+        str | None,
+        typer.Option("--label", metavar="N[,N…]", help="The file is a label map: smooth surfaces of these labels."),
+    ],
+    "crop": Annotated[
+        tuple[int, int, int, int, int, int] | None,
+        typer.Option("--crop", metavar="A B C D E F", help="Only voxels A to B - 1 along x, C to D - 1, E to F - 1."),
+    ],
+    "downsample": Annotated[
+        int | None, typer.Option("--downsample", min=1, metavar="N", help="Means over blocks of N x N x N voxels.")
+    ],
+    "follow": Annotated[
+        bool, typer.Option("--follow", help="Read data files outside the folder of the header that names them.")
+    ],
+}
+
+
+NONE: dict[str, Any] = {}
+"""No option given."""
+
+
+def with_reading(command: Callable[..., None]) -> Callable[..., None]:
+    """The same command with these options in place of its parameter `reading`, which gets those that were given."""
+
+    @wraps(command)
+    def with_options(**options: Any) -> None:
+        follow = options.pop("follow") or None
+        reading = given(**{name: options.pop(name) for name in OPTIONS if name in options}, follow=follow)
+        command(**options, reading=reading)
+
+    parameters = []
+    for parameter in inspect.signature(command).parameters.values():
+        if parameter.name != "reading":
+            parameters.append(parameter)
+            continue
+        for name, option in OPTIONS.items():
+            default = False if name == "follow" else None
+            parameters.append(Parameter(name, parameter.kind, default=default, annotation=option))
+    with_options.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+    with_options.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    return with_options
 
 
 def labels_of(text: str | None) -> tuple[int, ...]:

@@ -1,151 +1,21 @@
 """``illumgrid run``: the whole chain, from a volume or a scene to a finished folder."""
 
-import shlex
-import sys
-from collections.abc import Callable, Sequence
-from contextlib import closing, suppress
-from dataclasses import dataclass, replace
-from functools import partial
+from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
-from shutil import rmtree
-from tempfile import gettempdir, mkdtemp
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from illumgrid.cli.long import check_spread, kept, shared_out, spread
-from illumgrid.cli.reading import (
-    Array,
-    Channel,
-    Crop,
-    Downsample,
-    Follow,
-    Label,
-    Spacing,
-    Time,
-    check_inside,
-    given,
-    labels_of,
-)
-from illumgrid.cli.terminal import Ignore, omitted_light, progress_bars, reported_warnings, say
+from illumgrid.cli.outcome import again, judged_light, report, save
+from illumgrid.cli.reading import NONE, with_reading
+from illumgrid.cli.scenes import in_harmonics, scene_input
+from illumgrid.cli.terminal import Ignore, progress_bars, reported_warnings, say
 from illumgrid.errors import BadInput, shown_range, tell
 
 if TYPE_CHECKING:
-    from illumgrid.field.builtin import Preset
-    from illumgrid.field.scene import Field, Scene
-    from illumgrid.field.volume import Side
-    from illumgrid.io.elsewhere import Source
-    from illumgrid.light import Illumination
-
-
-AROUND = ("studio", "sky", "floor", "box")
-"""Scenes around a volume, by the names of their constructors; the first is the default."""
-
-
-@dataclass(frozen=True)
-class Input:
-    """What is to be lit: a name for the folder of the result, and how the scene is made, blurred by `smooth` voxels.
-
-    `source` is the volume file of such a scene, where it is one.
-    """
-
-    name: str
-    make: Callable[[float], "Scene"]
-    preset: "Preset | None" = None
-    source: "Callable[[float], Source] | None" = None
-
-
-def scene_input(
-    source: str | None,
-    surroundings: str | None,
-    limits: tuple[float, float] | None,
-    inside: str | None,
-    signed: bool,
-    albedo: tuple[float, float, float] | None,
-    reading: dict[str, Any],
-) -> Input:
-    """Tell a volume file from a scene file and a built-in scene; nothing is read yet."""
-    from illumgrid.field.builtin import SCENES
-    from illumgrid.io.readers import volume_name
-
-    name = "nucleus" if source is None else source
-    preset = SCENES.get(name) if source is None or not Path(source).exists() else None
-    if preset or name.lower().endswith(".toml"):
-        if extra := given(
-            scene=surroundings, range=limits, inside=inside, signed=signed or None, albedo=albedo, **reading
-        ):
-            options = ", ".join(f"--{option}" for option in extra)
-            what, todo = ("built-in scene", "leave") if preset else ("scene file", "write them into the file and leave")
-            raise BadInput(
-                f"{options} came with the {what} {name!r}; expected a volume file with them: {todo} them out"
-            )
-        return Input(name, partial(_smoothed, preset.make), preset) if preset else _scene_file(name)
-    check_inside(inside, reading.get("label"))
-    if surroundings not in (None, *AROUND):
-        raise BadInput(f"--scene is {surroundings!r}; expected {', '.join(AROUND[:-1])} or {AROUND[-1]}")
-    if signed and (also := given(inside=inside, label=reading.get("label"))):
-        raise BadInput(
-            f"--signed and --{next(iter(also))} came together; expected one of them: --signed lights h >= c and h <= -c"
-        )
-    side: Side | None = None if signed else "below" if inside == "below" else "above"
-    from illumgrid.io.elsewhere import Source
-
-    labels = labels_of(reading.get("label"))
-    plain = {key: value for key, value in reading.items() if key != "label"}
-    read_as = partial(Source, name, plain, labels, side)
-    make = partial(_volume_scene, read_as, surroundings or AROUND[0], albedo, limits)
-    return Input(volume_name(name), make, source=read_as)
-
-
-def _scene_file(name: str) -> Input:
-    from illumgrid.io.readers import read_scene
-
-    return Input(Path(name).stem, lambda smooth: read_scene(name, smoothing=smooth))
-
-
-def _volume_scene(
-    read_as: "Callable[[float], Source]", surroundings: str, albedo: Any, limits: Any, smooth: float
-) -> "Scene":
-    """The fields of a volume with what is around them; both signs of it if its side is None."""
-    import numpy as np
-
-    from illumgrid.field.labels import fields_of
-    from illumgrid.field.scene import Material, Scene
-    from illumgrid.field.signed import signed_pair
-    from illumgrid.io.readers import volume_name
-
-    around: Callable[..., Scene] = getattr(Scene, surroundings)
-    source = read_as(smooth)
-    name, volumes = volume_name(source.path), source.volumes()
-    if source.labels:
-        each = {label: volume for label, volume in volumes.items() if label is not None}
-        return _around_all(around, fields_of(name, each, albedo, limits))
-    if source.side is None:
-        material = None if albedo is None else Material(np.asarray(albedo))
-        return _around_all(around, signed_pair(name, volumes[None], limits, material))
-    return around(volumes[None], albedo, limits, source.side, name)
-
-
-def _around_all(around: Callable[..., "Scene"], fields: "Sequence[Field]") -> "Scene":
-    """Several fields of one lattice with what `around` puts around the first."""
-    first = fields[0]
-    scene = around(first.volume, first.material.albedo, first.range, first.inside, first.name)
-    return replace(scene, fields=tuple(fields))
-
-
-def _in_harmonics(scene: "Scene", lights: str | None, degree: int | None) -> "Scene":
-    if lights not in (None, "sh"):
-        raise BadInput(f"--lights is {lights!r}; expected sh, or leave it out to keep each light of the scene")
-    if lights is None and degree is not None:
-        raise BadInput("--degree came without --lights sh; expected both")
-    return scene if lights is None else scene.in_harmonics(2 if degree is None else degree)
-
-
-def _smoothed(make: Callable[[], "Scene"], smooth: float) -> "Scene":
-    from illumgrid.field.volume import smooth as blur
-
-    scene = make()
-    return replace(scene, fields=tuple(replace(f, volume=blur(f.volume, smooth)) for f in scene.fields))
+    pass
 
 
 def _stage_options(settings: list[str]) -> dict[str, dict[str, str]]:
@@ -175,6 +45,7 @@ def _stages(names: dict[str, str], settings: list[str], run_wide: dict[str, int 
     return {kind: registry.make(kind, name, options[kind]) for kind, name in names.items()}
 
 
+@with_reading
 def run(
     source: Annotated[
         str | None,
@@ -242,14 +113,7 @@ def run(
     degree: Annotated[
         int | None, typer.Option(min=0, max=4, metavar="L", help="Of those harmonics: (L + 1)² layers. [default: 2]")
     ] = None,
-    spacing: Spacing = None,
-    channel: Channel = None,
-    time_step: Time = None,
-    array: Array = None,
-    label: Label = None,
-    crop: Crop = None,
-    downsample: Downsample = None,
-    follow: Follow = False,
+    reading: dict[str, Any] = NONE,
     settings: Annotated[
         list[str] | None, typer.Option("--set", metavar="STAGE.OPTION=VALUE", help="Any option of a stage, repeatable.")
     ] = None,
@@ -307,16 +171,6 @@ def run(
         check_spread(workers, dask)
         names = {"sampler": sampler, "backend": backend, "interpolator": interpolator}
         stages = _stages(names, settings or [], {"backend.threads": threads, "sampler.count": isovalues})
-        reading = given(
-            spacing=spacing,
-            channel=channel,
-            time=time_step,
-            array=array,
-            label=label,
-            crop=crop,
-            downsample=downsample,
-            follow=follow or None,
-        )
         asked = scene_input(source, surroundings, limits, inside, signed, albedo, reading)
         if no_embed and asked.source is None:
             raise BadInput(
@@ -328,7 +182,7 @@ def run(
         folder = output or Path(f"{asked.name}-light")
         if not (resume and store.is_run(folder)):
             store.claim(folder, overwrite)
-        scene = _in_harmonics(asked.make(smooth or 0.0), lights, degree)
+        scene = in_harmonics(asked.make(smooth or 0.0), lights, degree)
         scene = with_texels(scene, texels) if texels else scene
         numbers: dict[str, Any] = {
             "grid": grid,
@@ -347,7 +201,7 @@ def run(
             for finding in diagnose(field, nodes_over(field.volume, grid), smooth or 0.0):
                 tell(finding.name, finding.sentence)
                 if finding.name == "noise" and "noise" not in (ignore or []):
-                    say(f"  smoothed that far: {_again(finding.options)}")
+                    say(f"  smoothed that far: {again(finding.options)}")
         if backend == "auto":
             say(_why_auto())
         with closing(keep), spread(workers, dask, any_machine) as over, progress_bars(keep.standing) as progress:
@@ -358,12 +212,12 @@ def run(
         about = {"input": asked.name if source is None else source, "reading": reading, "smooth": smooth or 0.0}
         light = replace(light, recipe={**light.recipe, **about, "warnings": sentences})
         elsewhere = asked.source(smooth or 0.0) if no_embed and asked.source else None
-        _save(light, folder, not no_preview, overwrite or resume, elsewhere)
+        save(light, folder, not no_preview, overwrite or resume, elsewhere)
         keep.leave(folder)
-        light = _judged(light, stages, folder)
+        light = judged_light(light, stages, folder)
         about = {key: light.recipe[key] for key in ("reached", "reached_uncertain", "reached_on_walls")}
         store.amend(folder, {**about, "warnings": sentences})
-    _report(light, folder, picture=not no_preview)
+    report(light, folder, picture=not no_preview)
 
 
 def _why_auto() -> str:
@@ -371,91 +225,3 @@ def _why_auto() -> str:
     from illumgrid import registry
 
     return f"backend: {registry.auto_backend()} ({registry.WHY_AUTO})"
-
-
-def _save(light: "Illumination", folder: Path, preview: bool, overwrite: bool, source: "Source | None" = None) -> None:
-    """Save the light; where that fails, keep it elsewhere: hours of work are not lost to a full disk."""
-    try:
-        light.save(folder, preview=preview, overwrite=overwrite, source=source)
-    except Exception:
-        for place in (gettempdir(), "~"):
-            with suppress(Exception):
-                work = Path(mkdtemp(prefix="illumgrid-", dir=Path(place).expanduser()))
-                try:
-                    light.save(work / folder.name, preview=False, source=source)
-                except BaseException:
-                    rmtree(work, ignore_errors=True)
-                    raise
-                say(f"the light is kept in {work / folder.name}; move that folder to where you want it")
-                break
-        raise
-
-
-def _judged(light: "Illumination", stages: dict[str, Any], folder: Path) -> "Illumination":
-    """With the error that was reached; Ctrl-C ends the judgement, not the finished run."""
-    from illumgrid.chain import judged
-
-    try:
-        light = judged(light, stages["backend"])
-        _advise(light, stages)
-    except KeyboardInterrupt:
-        say(f"stopped before the error was measured; the light itself is complete in {folder}")
-    return light
-
-
-def _advise(light: "Illumination", stages: dict[str, Any]) -> None:
-    """Where more paths would not help much, say what would."""
-    import numpy as np
-
-    from illumgrid.accuracy.judge import remedies
-
-    recipe = light.recipe
-    if (stages["sampler"].name, stages["interpolator"].name) != ("direct", "nearest") or not recipe["reached"]:
-        return
-    noise = max((e or 0.0 for e in recipe["relative_error"]), default=0.0)
-    if recipe["reached"] < max(0.05, 1.5 * noise):
-        return
-    specs = [grid.spec for grid in light.grids]
-    try:
-        found = remedies(light.scene, stages["backend"], specs, recipe["bounces"], recipe["seed"])
-    except Exception as reason:  # a finished run is worth more than advice
-        tell("error", f"what would reduce the error could not be measured ({type(reason).__name__}: {reason})")
-        return
-    if not found:
-        return
-    text = f"interpolation between nodes is off by about {found['now']:.1%} at any number of paths"
-    if found["finer"] < 0.8 * found["now"]:
-        text += f"; --grid {2 * recipe['grid']} would reduce that to {found['finer']:.1%}"
-    if found["smooth"] < 0.8 * found["now"]:
-        smooth = np.hypot(recipe.get("smooth", 0.0), 1.0)  # by a voxel more: variances of blurs add up
-        text += f"; --smooth {smooth:.2g}, which lights a field without its noise, to {found['smooth']:.1%}"
-    tell("grid", text)
-
-
-def _again(options: str) -> str:
-    """The command line of this process, with another blur, in place of its result."""
-    words = ["illumgrid", *sys.argv[1:]]
-    for at in [k for k, word in enumerate(words) if word == "--smooth"][::-1]:
-        words[at : at + 2] = []
-    words = [word for word in words if not word.startswith("--smooth=") and word != "--overwrite"]
-    return f"{shlex.join(words)} {options} --overwrite"
-
-
-def _report(light: "Illumination", folder: Path, picture: bool) -> None:
-    recipe = light.recipe
-    errors = [e for e in recipe["relative_error"] if e is not None]
-    noise = f", noise about {max(errors):.1%} of the mean light" if errors else ""
-    plan, reached = recipe["plan"], recipe["reached"]
-    if plan:
-        for sentence in plan["why"]:
-            say(f"  {sentence}")
-    work = f"{recipe['queries'] - recipe['texels']} queries x {recipe['paths']} paths"
-    if recipe["texels"]:
-        work += f" and {recipe['texels']} texels of walls x {recipe['texel_paths']} paths"
-    say(f"{work} in {sum(recipe['seconds'].values()):.1f} s{noise}{omitted_light(recipe)}")
-    if reached:
-        predicted = f"; predicted: {plan['error']:.2%}" if plan else ""
-        on_walls = recipe["reached_on_walls"]
-        walls = f", on walls {on_walls:.2%} of theirs" if on_walls is not None else ""
-        say(f"error reached: {reached:.2%} +- {recipe['reached_uncertain']:.2%} of the mean light{walls}{predicted}")
-    say(f"wrote {folder}" + (f"; look at {folder / 'preview.png'}" if picture else ""))

@@ -1,0 +1,105 @@
+"""What follows when the light of a run is computed: it is saved, judged and reported."""
+
+import shlex
+import sys
+from contextlib import suppress
+from pathlib import Path
+from shutil import rmtree
+from tempfile import gettempdir, mkdtemp
+from typing import TYPE_CHECKING, Any
+
+from illumgrid.cli.terminal import omitted_light, say
+from illumgrid.errors import tell
+
+if TYPE_CHECKING:
+    from illumgrid.io.elsewhere import Source
+    from illumgrid.light import Illumination
+
+
+def save(light: "Illumination", folder: Path, preview: bool, overwrite: bool, source: "Source | None" = None) -> None:
+    """Save the light; where that fails, keep it elsewhere: hours of work are not lost to a full disk."""
+    try:
+        light.save(folder, preview=preview, overwrite=overwrite, source=source)
+    except Exception:
+        for place in (gettempdir(), "~"):
+            with suppress(Exception):
+                work = Path(mkdtemp(prefix="illumgrid-", dir=Path(place).expanduser()))
+                try:
+                    light.save(work / folder.name, preview=False, source=source)
+                except BaseException:
+                    rmtree(work, ignore_errors=True)
+                    raise
+                say(f"the light is kept in {work / folder.name}; move that folder to where you want it")
+                break
+        raise
+
+
+def judged_light(light: "Illumination", stages: dict[str, Any], folder: Path) -> "Illumination":
+    """With the error that was reached; Ctrl-C ends the judgement, not the finished run."""
+    from illumgrid.chain import judged
+
+    try:
+        light = judged(light, stages["backend"])
+        _advise(light, stages)
+    except KeyboardInterrupt:
+        say(f"stopped before the error was measured; the light itself is complete in {folder}")
+    return light
+
+
+def _advise(light: "Illumination", stages: dict[str, Any]) -> None:
+    """Where more paths would not help much, say what would."""
+    import numpy as np
+
+    from illumgrid.accuracy.judge import remedies
+
+    recipe = light.recipe
+    if (stages["sampler"].name, stages["interpolator"].name) != ("direct", "nearest") or not recipe["reached"]:
+        return
+    noise = max((e or 0.0 for e in recipe["relative_error"]), default=0.0)
+    if recipe["reached"] < max(0.05, 1.5 * noise):
+        return
+    specs = [grid.spec for grid in light.grids]
+    try:
+        found = remedies(light.scene, stages["backend"], specs, recipe["bounces"], recipe["seed"])
+    except Exception as reason:  # a finished run is worth more than advice
+        tell("error", f"what would reduce the error could not be measured ({type(reason).__name__}: {reason})")
+        return
+    if not found:
+        return
+    text = f"interpolation between nodes is off by about {found['now']:.1%} at any number of paths"
+    if found["finer"] < 0.8 * found["now"]:
+        text += f"; --grid {2 * recipe['grid']} would reduce that to {found['finer']:.1%}"
+    if found["smooth"] < 0.8 * found["now"]:
+        smooth = np.hypot(recipe.get("smooth", 0.0), 1.0)  # by a voxel more: variances of blurs add up
+        text += f"; --smooth {smooth:.2g}, which lights a field without its noise, to {found['smooth']:.1%}"
+    tell("grid", text)
+
+
+def again(options: str) -> str:
+    """The command line of this process, with another blur, in place of its result."""
+    words = ["illumgrid", *sys.argv[1:]]
+    for at in [k for k, word in enumerate(words) if word == "--smooth"][::-1]:
+        words[at : at + 2] = []
+    words = [word for word in words if not word.startswith("--smooth=") and word != "--overwrite"]
+    return f"{shlex.join(words)} {options} --overwrite"
+
+
+def report(light: "Illumination", folder: Path, picture: bool) -> None:
+    """Say what was computed, in which time, how far off it is and where it lies."""
+    recipe = light.recipe
+    errors = [e for e in recipe["relative_error"] if e is not None]
+    noise = f", noise about {max(errors):.1%} of the mean light" if errors else ""
+    plan, reached = recipe["plan"], recipe["reached"]
+    if plan:
+        for sentence in plan["why"]:
+            say(f"  {sentence}")
+    work = f"{recipe['queries'] - recipe['texels']} queries x {recipe['paths']} paths"
+    if recipe["texels"]:
+        work += f" and {recipe['texels']} texels of walls x {recipe['texel_paths']} paths"
+    say(f"{work} in {sum(recipe['seconds'].values()):.1f} s{noise}{omitted_light(recipe)}")
+    if reached:
+        predicted = f"; predicted: {plan['error']:.2%}" if plan else ""
+        on_walls = recipe["reached_on_walls"]
+        walls = f", on walls {on_walls:.2%} of theirs" if on_walls is not None else ""
+        say(f"error reached: {reached:.2%} +- {recipe['reached_uncertain']:.2%} of the mean light{walls}{predicted}")
+    say(f"wrote {folder}" + (f"; look at {folder / 'preview.png'}" if picture else ""))
