@@ -13,16 +13,12 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from illumgrid.backends.lights_numpy import Ints
+from illumgrid.backends.lights_numpy import Bools, Ints
+from illumgrid.backends.march_numpy import cell_normal, gradient_normal
 from illumgrid.backends.mesh.bvh import unit_cube
 from illumgrid.backends.mesh.meshes import LevelMesh, Meshes, check_opaque, meshed, row_groups
 from illumgrid.backends.numba_ import pool, share
-from illumgrid.backends.reference import (
-    Bools,
-    answer,
-    cell_normal,
-    gradient_normal,
-)
+from illumgrid.backends.reference import answer
 from illumgrid.constants import BURIED, CAP, LOST, MISS, NOWHERE, SURFACE
 from illumgrid.errors import BadInput
 from illumgrid.field.levelset import Marchable

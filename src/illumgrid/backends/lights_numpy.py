@@ -11,6 +11,7 @@ from illumgrid.field.lights import basis
 from illumgrid.field.volume import Floats
 
 Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
 
 
 def cosine_direction(u1: Floats, u2: Floats, normal: Floats) -> Floats:

@@ -6,11 +6,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from illumgrid.cli.reading import (
-    check_inside,
-    given,
-    labels_of,
-)
+from illumgrid.cli.reading import check_inside, given, labels_of
 from illumgrid.errors import BadInput
 
 if TYPE_CHECKING:
