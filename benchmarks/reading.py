@@ -29,8 +29,8 @@ def fields(folder):
 
     def block(volume, side=40):
         at = [(n - side) // 2 for n in volume.shape]
-        values = volume.values[tuple(slice(a, a + side) for a in at)]
-        return replace(volume, values=values)
+        stored = volume.stored[tuple(slice(a, a + side) for a in at)]
+        return replace(volume, stored=stored)
 
     made = {
         "nucleon": ("nucleon.nrrd", (40, 200), 49, lambda v: v),

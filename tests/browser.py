@@ -96,7 +96,7 @@ def bent(n=(22, 17, 25)):
 def pair():
     """Two fields in a room, one of integers and one of floats."""
     one, other = ball(18, at=(-0.3, 0, 0.1)), ball(15, at=(0.4, -0.2, -0.3))
-    whole = one.with_values(np.round(3000 * one.values))
+    whole = one.with_stored(np.round(3000 * one.values))
     fields = (
         Field("one", whole, Material((0.8, 0.4, 0.3)), (2100.0, 3000.0)),
         Field("other", other, Material((0.3, 0.5, 0.8)), (0.7, 1.0)),

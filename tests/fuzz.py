@@ -381,7 +381,7 @@ def mutated(target: Target, clean: bytes, case: int) -> tuple[bytes, bool]:
 def content(result: Any) -> object:
     """What was read, to be compared."""
     if isinstance(result, Volume):
-        return result.values.tobytes(order="F"), result.shape, result.intercept, result.slope
+        return result.stored.tobytes(order="F"), result.shape, result.intercept, result.slope
     return result
 
 

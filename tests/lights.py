@@ -26,7 +26,7 @@ def lopsided_light(direction, nodes=5, origin=ORIGIN):
     volume = lopsided(direction, origin)
     fields = (
         Field("egg", volume, Material((0.8, 0.5, 0.2)), (0.55, 0.85)),
-        Field("shell", volume.with_values(-volume.values), Material((0.2, 0.4, 0.9)), (-0.8, -0.6), "below"),
+        Field("shell", volume.with_stored(-volume.values), Material((0.2, 0.4, 0.9)), (-0.8, -0.6), "below"),
     )
     scene = Scene(fields, background=np.ones(3))
     grids = []

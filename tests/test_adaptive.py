@@ -43,7 +43,7 @@ def test_level_sets_of_a_paraboloid_come_closer_as_its_slope_grows():
 def test_whole_numbers_leave_no_comb():
     fine = sampled(lambda x: 60 - 3 * np.linalg.norm(x, axis=1), (33, 33, 33), (-16, -16, -16))
     edges = np.linspace(20, 50, 301)  # ten bins to a whole number
-    distance = distance_between(field_of(fine.with_values(np.round(fine.values)), (20, 50)), edges)
+    distance = distance_between(field_of(fine.with_stored(np.round(fine.values)), (20, 50)), edges)
     assert np.abs(distance / (0.1 / 3) - 1).max() < 0.15
 
 

@@ -77,7 +77,7 @@ def hills(noise):
         lambda x: sum(np.exp(-((x - at) ** 2).sum(axis=1) / (2 * width**2)) for at, width in peaks),
         (24, 24, 24), spacing=(1 / 23,) * 3,
     )  # fmt: skip
-    return volume.with_values(volume.values + noise * random.standard_normal(volume.shape)), (0.3, 1.5)
+    return volume.with_stored(volume.values + noise * random.standard_normal(volume.shape)), (0.3, 1.5)
 
 
 def melting():

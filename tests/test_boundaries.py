@@ -72,7 +72,7 @@ def test_a_smooth_hill_is_swept_about_its_steepest_level():
 def test_below_is_above_of_the_opposite_field(make):
     volume = make()
     low, high, _ = suggest_range(volume)
-    turned = suggest_range(volume.with_values(-volume.values), "below")
+    turned = suggest_range(volume.with_stored(-volume.values), "below")
     assert turned[:2] == pytest.approx((-high, -low), abs=1e-4)
 
 
@@ -110,7 +110,7 @@ def test_the_range_leaves_haze_that_the_border_cuts():
     assert (faces > 27).mean() > 0.1  # the middle of 13 to 40, where most of the boundaries are
     low, high, _ = suggest_range(volume)
     assert (faces > low).mean() == pytest.approx(0.05, abs=0.01) and low < high < 0.7 * volume.values.max()
-    opposite = suggest_range(volume.with_values(-volume.values), "below")
+    opposite = suggest_range(volume.with_stored(-volume.values), "below")
     assert opposite[:2] == pytest.approx((-high, -low), rel=1e-3)
 
 

@@ -28,7 +28,7 @@ def hills(n=48, seed=0, noise=0.0):
         lambda x: sum(np.exp(-((x - at) ** 2).sum(axis=1) / (2 * width**2)) for at, width in peaks),
         (n, n, n), spacing=np.full(3, 1 / (n - 1)),
     )  # fmt: skip
-    return volume.with_values(volume.values + noise * random.standard_normal(volume.shape))
+    return volume.with_stored(volume.values + noise * random.standard_normal(volume.shape))
 
 
 def torus(n=40):
@@ -43,7 +43,7 @@ def torus(n=40):
 @pytest.mark.parametrize("inside", ["above", "below"])
 def test_clean_data_are_left_alone(volume, limits, inside):
     if inside == "below":
-        volume, limits = volume.with_values(-volume.values), (-limits[1], -limits[0])
+        volume, limits = volume.with_stored(-volume.values), (-limits[1], -limits[0])
     assert findings(volume, limits, inside=inside) == {}
 
 
@@ -109,7 +109,7 @@ def test_turning_does_not_depend_on_the_slabs(monkeypatch):
 
 def test_thin_parts_are_reported_with_the_grid_that_would_do():
     slab = sampled(lambda x: 1 - np.abs(x[:, 2]) / 0.06, (40, 40, 40), origin=(-1,) * 3, spacing=np.full(3, 2 / 39))
-    padded = slab.with_values(np.where(np.abs(np.indices(slab.shape) - 19.5).max(axis=0) > 17, -16, slab.values))
+    padded = slab.with_stored(np.where(np.abs(np.indices(slab.shape) - 19.5).max(axis=0) > 17, -16, slab.values))
     assert "resample" in findings(padded, (0.2, 0.6), grid=48)["thin"]
     for grid in (20, 40):  # 40 nodes would lie on the voxels, the worst place
         assert "--grid 48 has 1.2 nodes per voxel" in findings(padded, (0.2, 0.6), grid=grid)["thin"]
@@ -120,7 +120,7 @@ def test_the_border_is_reported_with_its_planes():
     found = findings(ball(20, at=(0.6, 0, 0)), (0.3, 0.9))["border"]
     assert "the last x plane" in found and "first" not in found
     below = ball(20, at=(0.6, 0, 0))
-    found = findings(below.with_values(-below.values), (-0.9, -0.3), inside="below")["border"]
+    found = findings(below.with_stored(-below.values), (-0.9, -0.3), inside="below")["border"]
     assert "the last x plane" in found and "first" not in found
 
 
@@ -165,7 +165,7 @@ def test_critical_isovalues_are_found_where_they_are():
     assert at == pytest.approx(0.5 - 0.8, abs=0.07) and what == "tunnels 0 to 1"
     assert critical_isovalues(Field("ball", ball(30), range=(0.3, 0.9))) == []
     # The same from the other side.
-    negative = pair.with_values(-pair.values)
+    negative = pair.with_stored(-pair.values)
     ((at, _),) = critical_isovalues(Field("pair", negative, range=(-1.0, -0.4), inside="below"))
     assert at == pytest.approx(-0.7, abs=0.02)
 

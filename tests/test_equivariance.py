@@ -139,7 +139,7 @@ def test_a_place_in_the_world_changes_no_path_between_voxels():
 def test_below_on_the_negative_is_above(values, backend):
     up = colored(furnace(Volume(values, spacing=SPACING)))
     field = up.fields[0]
-    negative = Field(field.name, field.volume.with_values(-values), field.material, -field.range[::-1], "below")
+    negative = Field(field.name, field.volume.with_stored(-values), field.material, -field.range[::-1], "below")
     down = Scene((negative,), background=up.background)
     queries = on_voxels(up)
     mirrored = on_voxels(down)

@@ -84,7 +84,7 @@ def test_a_texel_inside_a_solid_is_a_hole_and_one_outside_is_not(inside, backend
 
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_a_lamp_inside_a_solid_and_the_back_of_a_lamp_are_dark(backend):
-    volume = noise(2, (6, 6, 6)).with_values(np.ones((6, 6, 6)) + np.arange(6)[:, None, None] * 0.01)
+    volume = noise(2, (6, 6, 6)).with_stored(np.ones((6, 6, 6)) + np.arange(6)[:, None, None] * 0.01)
     scene = Scene.box(volume, range=(0.5, 1.02))
     *walls, light = scene.quads
     middle = np.full(3, 2.5)

@@ -32,7 +32,7 @@ def grey(volume, **rest):
 
 def unit(volume):
     low, high = volume.extremes
-    return volume.with_values(((volume.values - low) / (high - low)).astype(np.float32))
+    return volume.with_stored(((volume.values - low) / (high - low)).astype(np.float32))
 
 
 SCENES = {

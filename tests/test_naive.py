@@ -354,7 +354,7 @@ def test_placement_in_the_world_changes_no_path(name):
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_which_side_a_ray_is_on_survives_a_mirrored_array(axis):
     volume = noisy()
-    mirrored = volume.with_values(np.flip(volume.values, axis))
+    mirrored = volume.with_stored(np.flip(volume.values, axis))
     flip = np.ones(3)
     flip[axis] = -1
     shift = (1 - flip) / 2 * 5

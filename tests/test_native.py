@@ -61,6 +61,21 @@ def test_the_light_is_the_same(lights):
             assert np.array_equal(getattr(one, name), getattr(other, name))
 
 
+@pytest.mark.parametrize("inside", ["above", "below"])
+def test_a_map_to_other_units_leaves_the_light_as_it_is(inside):
+    """Powers of 2 round nothing: in units of a quarter the same isovalues have the same surfaces."""
+    native, found = pair("uint8")[0], []
+    for slope, intercept in ((1.0, 0.0), (0.25, -8.0)):
+        volume = replace(native, slope=slope, intercept=intercept)
+        assert volume.stored is native.stored or np.array_equal(volume.stored, native.stored)
+        scene = Scene.studio(volume, range=[slope * c + intercept for c in at("uint8", 0.5, 0.8)], inside=inside)
+        light = ig.run(scene, grid=14, paths=4, bounces=2, isovalues=3)
+        level = slope * at("uint8", 0.6)[0] + intercept
+        picture = render(light, isovalue=level, width=48, height=40, engine="software")
+        found.append((light.grids[0].light, light.grids[0].error, picture, isosurface(volume, level, inside).vertices))
+    assert all(np.array_equal(one, other) for one, other in zip(*found))
+
+
 def test_the_light_is_the_same_in_the_large_bricks_of_large_fields(lights, monkeypatch):
     monkeypatch.setattr(bricks, "LARGE", 0)
     monkeypatch.setattr(levelset, "_LAID", WeakKeyDictionary())

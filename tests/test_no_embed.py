@@ -8,7 +8,10 @@ import OpenEXR
 import pytest
 
 import illumgrid as ig
+from illumgrid.field.volume import Volume, smooth
 from illumgrid.io import store
+from illumgrid.io.elsewhere import Source, digest, fields_again, referred
+from illumgrid.io.readers import read_volume
 from shapes import ball
 
 QUICK = ("--grid", "6", "--paths", "2", "--bounces", "1", "--no-preview")
@@ -65,6 +68,24 @@ def test_a_file_that_is_gone_or_changed_is_refused_in_a_sentence(call, tmp_path,
     np.save(tmp_path / "there" / "v.npy", values)
     said = call("preview", "there/out", "--output", "b.png", code=2)
     assert said.count("\n") == 1 and "has changed since it was lit" in said
+
+
+def test_fields_of_a_scaled_file_that_were_kept_in_single_precision_are_found_again(tmp_path):
+    import nibabel
+
+    stored = np.round(100 * ball(10).values).astype(np.int16)
+    image = nibabel.Nifti1Image(stored, np.eye(4))
+    image.header.set_slope_inter(0.1, -3)
+    nibabel.save(image, tmp_path / "v.nii")
+    source = Source(str(tmp_path / "v.nii"), {}, [], "above", 0.7)
+    place = read_volume(tmp_path / "v.nii")
+    units = (stored * float(np.float32(0.1)) - 3).astype(np.float32)
+    old = smooth(Volume(units, place.origin, place.spacing, place.direction), 0.7)
+    (new,) = source.volumes().values()
+    for volume in (old, new):
+        (found,) = fields_again(referred(source, tmp_path), tmp_path, [digest(volume)])
+        assert np.array_equal(found.values, volume.values) and found.slope == volume.slope
+    assert new.slope != 1
 
 
 def test_a_scene_has_no_file_to_refer_to(refuse, tmp_path, bytes_file):

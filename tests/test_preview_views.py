@@ -81,7 +81,7 @@ def test_a_background_has_the_colour_that_was_asked_for():
 def test_the_camera_of_a_sweep_holds_the_solids_of_all_its_settings():
     one = Field("one", ball(20, at=(-0.5, 0, 0)), Material(np.array([0.9, 0.1, 0.1])), (0.7, 1.1))
     two = Field("two", ball(20, at=(0.5, 0, 0)), Material(np.array([0.1, 0.1, 0.9])), (0.7, 1.1))
-    other_side = replace(two, volume=two.volume.with_values(-two.volume.values), range=(-1.1, -0.7), inside="below")
+    other_side = replace(two, volume=two.volume.with_stored(-two.volume.values), range=(-1.1, -0.7), inside="below")
     for scene in (Scene((one, two), background=np.ones(3)), Scene((one, other_side), background=np.ones(3))):
         camera = fit_camera(scene, widest_row(scene), 4 / 3)
         for isovalue in (0.7, 0.9, 1.1):

@@ -71,6 +71,14 @@ def test_slices(tmp_path, more):
     check(read(series(tmp_path / "a", field, **more)), field)
 
 
+def test_values_stay_as_small_as_the_pixels(tmp_path):
+    whole = read(series(tmp_path / "a", HOUNSFIELD))
+    assert whole.stored.dtype == np.int16 and whole.values is whole.stored
+    field = np.round((HOUNSFIELD + 1024) / 0.3) * 0.3 - 1024
+    scaled = read(series(tmp_path / "b", field, slope=0.3))
+    assert scaled.stored.dtype == np.uint16 and np.allclose(scaled.values, field, rtol=0, atol=1e-10)
+
+
 def test_sub_folders_and_what_else_lies_there(tmp_path):
     series(tmp_path / "study" / "a", ks=range(3))
     series(tmp_path / "study" / "b", ks=range(3, 7))

@@ -84,13 +84,13 @@ def test_what_has_no_two_signs_is_refused():
 def test_the_suggested_magnitudes_are_those_of_the_absolute_value():
     volume = orbital()
     low, high, _ = suggest_magnitudes(volume)
-    assert (low, high) == ig.suggest_range(volume.with_values(np.abs(volume.values)))[:2]
+    assert (low, high) == ig.suggest_range(volume.with_stored(np.abs(volume.values)))[:2]
     assert 0 < low < high < volume.extremes[1]
     assert signed_pair("o", volume)[1].range.tolist() == [-high, -low]
 
 
 def test_signs_are_noticed_where_both_mean_something():
-    assert has_both_signs(orbital()) and has_both_signs(orbital().with_values(-orbital().values))
+    assert has_both_signs(orbital()) and has_both_signs(orbital().with_stored(-orbital().values))
     noise = np.random.default_rng(0).normal(0, 0.01, (9, 9, 9))
     noise[4, 4, 4] = 1
     scan = np.random.default_rng(1).normal(50, 15, (12, 12, 12))  # muscle and fat in Hounsfield units, near 0
@@ -115,7 +115,7 @@ def test_without_signed_the_suggested_range_stays_on_the_solids_side_of_zero(far
         assert (low, high) == suggest_magnitudes(volume)[:2]
     least, most, why = suggest_range(volume, "below")
     assert volume.extremes[0] < least < most < 0 and "negative side" in why
-    turned = suggest_range(volume.with_values(-10 - volume.values), "below")
+    turned = suggest_range(volume.with_stored(-10 - volume.stored), "below")
     assert turned[:2] == pytest.approx((-high, -low), rel=1e-6)
 
 

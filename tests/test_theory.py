@@ -119,7 +119,7 @@ def test_a_voxel_of_a_convex_body_gathers_pi_on_every_path(inside, backend):
     # all of the solid on one side. Whoever asks one of the eight cells which side a direction is on loses light here.
     volume = paraboloid(9)
     if inside == "below":
-        volume = volume.with_values(-volume.values)
+        volume = volume.with_stored(-volume.values)
     scene = Scene.sky(volume, [0.5] * 3, sorted([volume.values.min(), volume.values.max()]), inside)
     queries = on_voxels(scene)
     answer = BACKENDS[backend].solve(scene, queries, paths=range(100 if backend == "numba" else 4), bounces=2, seed=2)
@@ -161,7 +161,7 @@ def test_no_light_leaks_into_a_sealed_cavity(name, scale, extents):
     origin = extents * 13 * spacing.max() * np.array([1, -1, 1])
     volume, inside = cavity(CAVITIES[name], spacing=spacing, origin=origin, direction=rotation()), "above"
     if scale == 1e6:
-        volume, inside = volume.with_values(-volume.values), "below"
+        volume, inside = volume.with_stored(-volume.values), "below"
     scene, queries = sealed(volume, inside, high=CAVITIES[name].max())
     assert len(queries) > 1000
     answer = Numba().solve(scene, queries, paths=range(40000 // len(queries) + 1), bounces=6, seed=4)

@@ -1,5 +1,7 @@
 """Fields with a large offset, or a tiny or huge scale, keep their digits: isovalues are in their own units."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -7,7 +9,7 @@ import illumgrid as ig
 from illumgrid.errors import BadInput, shown, shown_range
 from illumgrid.field.diagnosis import critical_isovalues, diagnose, plateaus
 from illumgrid.field.lattice import GridSpec
-from illumgrid.field.volume import interpolate
+from illumgrid.field.volume import NATIVE, interpolate
 from illumgrid.samplers.adaptive import adaptive_rows
 from illumgrid.transport.samples import in_frame
 
@@ -22,7 +24,8 @@ def ball(n=17):
 @pytest.mark.parametrize(("scale", "offset"), MAPS)
 def test_mesh_is_that_of_the_plain_field(scale, offset):
     plain, mapped = ig.Volume(ball()), ig.Volume(offset + scale * ball())
-    assert mapped.values.dtype == np.float32
+    assert mapped.stored.dtype == np.float32
+    assert np.allclose(mapped.values, offset + scale * ball(), rtol=1e-15, atol=1e-7 * scale)
     for level in (0.6, 0.75):
         here, there = ig.isosurface(plain, level), ig.isosurface(mapped, offset + scale * level)
         assert len(there.faces) == len(here.faces)
@@ -111,11 +114,49 @@ def test_values_that_single_precision_holds_are_kept_as_they_are():
 
 def test_a_map_that_is_given():
     volume = ig.Volume(np.arange(8, dtype=np.uint8).reshape(2, 2, 2), slope=0.5, intercept=-3)
-    assert volume.extremes == (-3.0, 0.5) and np.array_equal(volume.values.ravel(), np.arange(8))
-    turned = ig.Volume(np.arange(8, dtype=np.uint8).reshape(2, 2, 2), slope=-0.5, intercept=-3)
-    assert turned.slope == 0.5 and turned.extremes == (-6.5, -3.0)
+    assert volume.extremes == (-3.0, 0.5) and np.array_equal(volume.stored.ravel(), np.arange(8))
+    assert np.array_equal(volume.values.ravel(), 0.5 * np.arange(8) - 3) and volume.stored.dtype == np.uint8
     with pytest.raises(BadInput, match=r"slope and intercept are 0.0 and 1.0"):
         ig.Volume(np.zeros((2, 2, 2)), slope=0, intercept=1)
+
+
+@pytest.mark.parametrize("kind", [kind for kind in NATIVE if kind.kind != "f"])
+def test_a_negative_slope_turns_whole_numbers_within_their_type(kind):
+    ends = np.iinfo(kind)
+    given = np.array([ends.min, ends.max, 1, 3, 5, 7, 9, 11], kind).reshape(2, 2, 2)
+    volume = ig.Volume(given, slope=-0.5, intercept=-3)
+    assert volume.slope == 0.5 and volume.stored.dtype == kind
+    assert np.array_equal(volume.values, -0.5 * given - 3.0)
+
+
+@pytest.mark.parametrize(
+    ("kind", "slope", "intercept", "kept"),
+    [
+        *(("uint16", 1, -1024, "int16"), ("int16", 2, 1000, "int16"), ("uint8", 1, -128, "int8")),
+        *(("int8", 1, 128, "uint8"), ("uint16", -1, 65535, "uint16"), ("int16", -1, 0, "int16")),
+        *(("uint8", 1, -1024, None), ("uint8", 2, 200, None), ("uint16", 0.1, 0, None), ("int16", 1, 0.5, None)),
+    ],
+)
+def test_whole_numbers_stay_as_small_as_they_come(kind, slope, intercept, kept):
+    given = np.array([0, 1, 2, 3, 40, 50, 60, 100]).astype(kind).reshape(2, 2, 2)
+    volume = ig.Volume(given, slope=slope, intercept=intercept)
+    assert np.array_equal(volume.values, slope * given.astype(float) + intercept)
+    assert volume.stored.itemsize == given.itemsize and volume.plain == (kept is not None)
+    assert volume.stored.dtype == (kept or kind) and (not kept or volume.values is volume.stored)
+
+
+def test_a_volume_with_something_replaced_is_the_same_field():
+    volume = ig.Volume(np.arange(8, dtype=np.uint8).reshape(2, 2, 2), slope=-0.5, intercept=-3)
+    moved = replace(volume, origin=(1, 2, 3), unit="mm")
+    assert np.array_equal(moved.values, volume.values) and moved.origin.tolist() == [1, 2, 3] and moved.unit == "mm"
+    assert np.shares_memory(moved.stored, volume.stored)
+    with pytest.raises(BadInput, match="expected one of them"):  # mapped once, or twice?
+        replace(volume, values=volume.values)
+
+
+def test_a_map_that_leads_beyond_double_precision_is_refused():
+    with pytest.raises(BadInput, match="beyond the numbers of double precision"):
+        ig.Volume(np.arange(8, dtype=np.uint8).reshape(2, 2, 2), slope=1e308)
 
 
 def test_numbers_are_distinguished():
@@ -133,7 +174,7 @@ def test_exports_keep_the_digits(tmp_path):
     for ending in ("nrrd", "vti", "npz"):
         exports.write(light, tmp_path / f"a.{ending}", on="field", array="field" if ending == "nrrd" else None)
     for back in (ig.read_volume(tmp_path / "a.nrrd"), ig.read_volume(tmp_path / "a.vti", array="field")):
-        assert np.allclose(back.in_units(back.values.astype(float)), 1e6 + 0.2 * ball(), rtol=0, atol=1e-7)
+        assert np.allclose(back.values, 1e6 + 0.2 * ball(), rtol=0, atol=1e-7)
     with np.load(tmp_path / "a.npz") as arrays:
         assert np.allclose(arrays["field"], 1e6 + 0.2 * ball(), rtol=0, atol=1e-7)
     with pytest.raises(ig.BadInput, match="double precision"):

@@ -29,7 +29,7 @@ def in_solid(field, level, point):
     """Which world points (n, 3) lie in the solid of a field at isovalues (n,)."""
     volume, sign = field.volume, 1.0 if field.inside == "above" else -1.0
     index = (point - volume.origin) @ volume.direction / volume.spacing
-    height = map_coordinates(sign * volume.values, index.T, order=1, mode="constant", cval=np.finfo(np.float32).min)
+    height = map_coordinates(sign * volume.stored, index.T, order=1, mode="constant", cval=np.finfo(np.float32).min)
     return height >= sign * volume.to_stored(level)
 
 

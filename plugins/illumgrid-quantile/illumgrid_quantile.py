@@ -26,7 +26,7 @@ class Quantile:
         """Ask on `count` level sets: see `illumgrid.stages.Sampler`."""
         field = scene.fields[0]
         low, high = field.stored_range
-        values = field.volume.values
+        values = field.volume.stored
         swept = values[(values >= low) & (values <= high)]
         share = (np.arange(self.count) + 0.5) / self.count
         levels = field.volume.in_units(np.quantile(swept if swept.size else [low, high], share))

@@ -67,7 +67,7 @@ def remedies(scene: Scene, backend: Backend, specs: Sequence[GridSpec], bounces:
     """
     longest = max(max(spec.shape) for spec in specs)
     tried = [("now", scene, specs), ("finer", scene, specs_over(scene, 2 * longest))]
-    if all(f.volume.values.size <= _SMALL for f in scene.fields):
+    if all(f.volume.stored.size <= _SMALL for f in scene.fields):
         soft = replace(scene, fields=tuple(replace(f, volume=smooth(f.volume, 1.0)) for f in scene.fields))
         tried.append(("smooth", soft, specs))
     found = {"smooth": np.inf}

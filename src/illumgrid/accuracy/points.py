@@ -72,7 +72,7 @@ def _cells_by_step(field: Field, random: np.random.Generator) -> tuple[NDArray[n
     nx, ny, nz = field.volume.shape
     many, at_once = (nx - 1) * (ny - 1), max(1, AT_ONCE // (4 * nz))
     columns = np.arange(many)
-    if field.volume.values.size > _LOOKED_AT:
+    if field.volume.stored.size > _LOOKED_AT:
         columns = np.sort(random.choice(many, _LOOKED_AT // nz, replace=False))
     parts = [_crossed(field, columns[first : first + at_once]) for first in range(0, len(columns), at_once)]
     cells, first, last = (np.concatenate(each) for each in zip(*parts))
@@ -89,7 +89,7 @@ def _crossed(
     x, y = np.divmod(columns, ny - 1)
     steps = []
     for corner in np.ndindex(2, 2):
-        share = field.volume.values[x + corner[0], y + corner[1]].astype(np.float32, copy=False) - lowest
+        share = field.volume.stored[x + corner[0], y + corner[1]].astype(np.float32, copy=False) - lowest
         share *= _STEPS / (highest - lowest)
         steps.append(np.clip(np.floor(share, out=share), -1, _STEPS, out=share).astype(np.int8))
     low, high = (of.reduce(steps) for of in (np.minimum, np.maximum))

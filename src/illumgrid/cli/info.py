@@ -80,7 +80,7 @@ def _describe_volume(source: str, limits: tuple[float, float] | None, inside: "S
     if len(labels) > 1:
         raise BadInput(f"--label holds {len(labels)} labels; expected one for info; ask for one after another")
     volume = finite(read_volume(source, **reading, label=labels[0] if labels else None), inside)
-    needs.check("info", needs.of_field(volume.values.size, needs.TO_DESCRIBE), "cut or --downsample the volume")
+    needs.check("info", needs.of_field(volume.stored.size, needs.TO_DESCRIBE), "cut or --downsample the volume")
     _describe_lattice(volume_name(source), volume, histogram(volume, store.BINS)[0].tolist(), volume.extremes)
     low, high, why = suggest_range(volume, inside)
     if labels:

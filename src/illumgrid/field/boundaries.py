@@ -78,17 +78,16 @@ def has_both_signs(volume: Volume) -> bool:
         return False
     ends = volume.to_stored(np.array([-_SMALL, _SMALL]) * min(-low, high))
     counts, _ = histogram(volume, 21, (float(ends.min()), float(ends.max())))
-    return bool(counts.sum() > 0.5 * volume.values.size and abs(int(np.argmax(counts)) - 10) <= 1)
+    return bool(counts.sum() > 0.5 * volume.stored.size and abs(int(np.argmax(counts)) - 10) <= 1)
 
 
 def _parts(volume: Volume, part: Callable[[Floats], Floats]) -> Volume:
     """The volume with a function of h, 0 where h is not finite."""
-    plain = volume.slope == 1 and volume.intercept == 0
-    values = np.empty(volume.shape, np.float32 if plain else np.float64)
+    values = np.empty(volume.shape, np.float32 if volume.plain else np.float64)
     for slab in slabs(volume.shape):
-        h = volume.in_units(volume.values[slab].astype(values.dtype))
+        h = volume.in_units(volume.stored[slab].astype(values.dtype))
         values[slab] = part(np.nan_to_num(h, nan=0.0, posinf=0.0, neginf=0.0))
-    return replace(volume, values=values, slope=1.0, intercept=0.0)
+    return replace(volume, stored=values, slope=1.0, intercept=0.0)
 
 
 def _on_one_side(volume: Volume, inside: Side) -> tuple[float, float, str]:
@@ -133,7 +132,7 @@ def _out_of_haze(
     boundaries in the haze, which the border cuts; what people look for are the bodies within. Fields of several classes
     are left as they are: a crop may cut skin.
     """
-    faces = [np.take(volume.values, end, axis=axis).ravel() for axis in range(3) for end in (0, -1)]
+    faces = [np.take(volume.stored, end, axis=axis).ravel() for axis in range(3) for end in (0, -1)]
     low, high = (float(x) for x in volume.stored_extremes)
     share = (np.concatenate(faces).astype(float) - low) / (high - low)
     border = share if UPWARD[inside] > 0 else 1 - share
@@ -196,7 +195,7 @@ def _blurred(volume: Volume, inside: Side) -> list[tuple[NDArray[np.float32], tu
     """Blurred parts of a volume, their values from 0 outside to 1 inside, and the slices that count."""
     from scipy.ndimage import gaussian_filter
 
-    v = volume.values
+    v = volume.stored
     low, high = (float(x) for x in volume.stored_extremes)
     found = []
     for block in _parts_of(volume.shape):
@@ -279,7 +278,7 @@ def _thickness(volume: Volume, isovalue: float, inside: Side) -> float:
     """Share of the solid's voxels whose six neighbours belong to it, too; 1 without any."""
     level, total, deep = volume.to_stored(isovalue), 0, 0
     for part in slabs((volume.shape[0] - 2, *volume.shape[1:])):
-        values = volume.values[part.start : part.stop + 2]
+        values = volume.stored[part.start : part.stop + 2]
         solid = values >= level if UPWARD[inside] > 0 else values <= level
         within = solid[1:-1, 1:-1, 1:-1].copy()
         total += int(np.count_nonzero(within))

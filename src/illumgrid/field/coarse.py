@@ -16,7 +16,7 @@ def block_means(volume: Volume, factors: Sequence[int]) -> Volume:
     nx, ny, nz = (-(-n // f) for n, f in zip(volume.shape, (x, y, z)))
     means = np.empty((nx, ny, nz))
     for rows in slabs((nx, *volume.shape[1:]), max(1, AT_ONCE // x)):
-        part = volume.values[rows.start * x : rows.stop * x]
+        part = volume.stored[rows.start * x : rows.stop * x]
         wanted = (rows.stop - rows.start) * x, ny * y, nz * z
         part = np.pad(part, [(0, int(n) - have) for n, have in zip(wanted, part.shape)], mode="edge")
         means[rows] = part.reshape(-1, x, ny, y, nz, z).mean(axis=(1, 3, 5), dtype=float)

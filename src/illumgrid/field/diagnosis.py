@@ -69,7 +69,7 @@ def plateaus(volume: Volume) -> list[Plateau]:
     -------
     list of Plateau
     """
-    v = volume.values
+    v = volume.stored
     size, first = _flat_pieces(v)
     large = np.flatnonzero(size >= _PLATEAU)
     if not len(large):
@@ -146,7 +146,7 @@ def turning(volume: Volume, low: float, high: float, blur: float = 0.0) -> float
     blur : float
         Voxels by which a Gaussian blurs the field before.
     """
-    total, pairs, small = 0.0, 0, volume.values.size <= _LOOKED_AT
+    total, pairs, small = 0.0, 0, volume.stored.size <= _LOOKED_AT
     for block in _slabs_of(volume.shape) if small else _blocks_of(volume.shape):
         more, count = _turning_in(volume, block, low, high, blur)
         total, pairs = total + more, pairs + count
@@ -172,7 +172,7 @@ def _turning_in(volume: Volume, block: tuple[slice, ...], low: float, high: floa
     """Squared differences of normals, summed over neighbouring voxels of the range from a block on, and how many."""
     from scipy.ndimage import gaussian_filter
 
-    v, around = volume.values, int(4 * blur + 0.5) + 1  # as far as the Gaussian reaches, and a voxel for the slopes
+    v, around = volume.stored, int(4 * blur + 0.5) + 1  # as far as the Gaussian reaches, and a voxel for the slopes
     outer = tuple(slice(max(s.start - around, 0), s.stop + around + 1) for s in block)
     part = v[outer]
     if not blur and not ((part >= low) & (part <= high)).any():
@@ -205,13 +205,13 @@ def _reduced(volume: Volume, longest: int) -> NDArray[Any]:
 
     spec = GridSpec.over(volume, min(longest, max(volume.shape)))
     if spec.shape == volume.shape:
-        return volume.values
+        return volume.stored
     factors = [max(1, n // (4 * m)) for n, m in zip(volume.shape, spec.shape)]
-    if volume.values.size > _LOOKED_AT and max(factors) > 1:
+    if volume.stored.size > _LOOKED_AT and max(factors) > 1:
         volume = block_means(replace(volume, slope=1.0, intercept=0.0), factors)
     step = (np.array(volume.shape) - 1) / (np.array(spec.shape) - 1)
     sigma = 0.5 * np.sqrt(np.maximum(step**2 - 1, 0))
-    soft = gaussian_filter(volume.values, sigma, output=np.float32, mode="nearest")
+    soft = gaussian_filter(volume.stored, sigma, output=np.float32, mode="nearest")
     index = np.meshgrid(*(np.arange(n) * s for n, s in zip(spec.shape, step)), indexing="ij")
     return np.asarray(map_coordinates(soft, index, order=1, mode="nearest"))
 
@@ -332,7 +332,7 @@ def _crossed_edges(values: NDArray[Any], slab: slice, isovalue: np.float64) -> I
 
 def _thin(field: Field, spec: GridSpec) -> Iterator[Finding]:
     volume, middle = field.volume, float(np.mean(field.range))
-    index = _crossings(volume.values, np.float64(volume.to_stored(middle)), 3000)
+    index = _crossings(volume.stored, np.float64(volume.to_stored(middle)), 3000)
     if not len(index):
         return
     inward = -outward_normals(volume, index, field.inside)
@@ -353,7 +353,7 @@ def _border(field: Field) -> Iterator[Finding]:
     faces, touched, total = [], 0, 0
     for axis, letter in enumerate("xyz"):
         for end, side in ((0, "first"), (-1, "last")):
-            plane = np.take(field.volume.values, end, axis=axis)
+            plane = np.take(field.volume.stored, end, axis=axis)
             met = int(np.count_nonzero(field.solid(plane, field.volume.to_stored(field.widest))))
             touched, total = touched + met, total + plane.size
             if met:
@@ -371,7 +371,7 @@ def _empty(field: Field) -> Iterator[Finding]:
     low, high = field.range
     levels = np.linspace(low, high, _LEVELS)
     below = _below_each(field.volume, field.volume.to_stored(levels))
-    smallest = np.minimum(below, field.volume.values.size - below)
+    smallest = np.minimum(below, field.volume.stored.size - below)
     bare = levels[smallest < _FEW]
     if len(bare):
         yield Finding(
@@ -383,12 +383,12 @@ def _empty(field: Field) -> Iterator[Finding]:
 
 def _below_each(volume: Volume, levels: Floats) -> NDArray[np.int64]:
     """How many voxels lie below each of some stored levels, increasing."""
-    if volume.values.dtype.kind != "f":
+    if volume.stored.dtype.kind != "f":
         values, counts = volume.tally
         return np.concatenate([[0], np.cumsum(counts)])[np.searchsorted(values, levels)]
     upto = np.zeros(len(levels) + 1, np.int64)
     for slab in slabs(volume.shape):
-        reached = np.searchsorted(levels, volume.values[slab].reshape(-1), side="right")
+        reached = np.searchsorted(levels, volume.stored[slab].reshape(-1), side="right")
         upto += np.bincount(reached, minlength=len(upto))
     return np.cumsum(upto)[:-1]
 

@@ -25,9 +25,8 @@ def labels_in(volume: Volume) -> list[int]:
 
     Such a volume has few values, all whole numbers, and is constant but for steps.
     """
-    v = volume.values
-    stride = max(1, int(np.ceil(np.sqrt(v.size / _SAMPLE))))
-    sample = v[:, ::stride, ::stride]
+    stride = max(1, int(np.ceil(np.sqrt(volume.stored.size / _SAMPLE))))
+    sample = volume.in_units(volume.stored[:, ::stride, ::stride])
     whole = sample[np.isfinite(sample)]
     if not len(whole) or (whole != np.round(whole)).any() or np.abs(whole).max() > 2**24:
         return []
@@ -35,7 +34,7 @@ def labels_in(volume: Volume) -> list[int]:
     if not 2 <= len(values) <= MOST:
         return []
     background = values[counts.argmax()]
-    found = [round(float(value)) for value in volume.in_units(values[values != background])]
+    found = [round(float(value)) for value in values[values != background]]
     if len(values) == 2:
         return found
     rank = np.searchsorted(values, np.nan_to_num(sample))

@@ -23,7 +23,7 @@ def off_the_data(volume: Volume, isovalue: float, inside: Side) -> float:
     Extraction exactly at data values would create duplicate faces and holes.
     """
     level = np.float32(isovalue)
-    if not any((volume.values[slab] == level).any() for slab in slabs(volume.shape)):
+    if not any((volume.stored[slab] == level).any() for slab in slabs(volume.shape)):
         return float(isovalue)
     return float(np.nextafter(level, np.float32(-np.inf * UPWARD[inside])))
 
@@ -70,7 +70,7 @@ def extract(volume: Volume, isovalue: float, inside: Side, capped: bool) -> tupl
     from skimage.measure import marching_cubes
 
     level = off_the_data(volume, float(volume.to_stored(isovalue)), inside)
-    low, high = float(volume.values.min()), float(volume.values.max())
+    low, high = float(volume.stored.min()), float(volume.stored.max())
     beyond = None
     if capped:
         spread = max(float(np.float32(high) - np.float32(low)), abs(level), 1e-30)
@@ -82,7 +82,7 @@ def extract(volume: Volume, isovalue: float, inside: Side, capped: bool) -> tupl
     exponent = int(np.frexp(high - low)[1])
     # Its faces wind by the left hand: "ascent" orients them, by the right hand, away from higher values.
     index, faces, _, _ = marching_cubes(
-        _scaled(volume.values, -exponent, beyond), float(np.ldexp(level, -exponent)),
+        _scaled(volume.stored, -exponent, beyond), float(np.ldexp(level, -exponent)),
         gradient_direction="ascent" if inside == "above" else "descent",
     )  # fmt: skip
     index = index.astype(float) - (1.0 if capped else 0.0)
@@ -152,7 +152,7 @@ class Marchable(NamedTuple):
 
 def _together(volumes: Sequence[Volume]) -> tuple[NDArray[Any], NDArray[np.int64]]:
     """The values of volumes as one flat array, and where each begins: a single volume is not copied."""
-    parts = list({id(volume.values): volume.values.reshape(-1) for volume in volumes}.items())
+    parts = list({id(volume.stored): volume.stored.reshape(-1) for volume in volumes}.items())
     ends = np.cumsum([0, *(len(values) for _, values in parts)], dtype=np.int64)
     first = {key: start for (key, _), start in zip(parts, ends)}
     kind = np.result_type(*(values for _, values in parts))
@@ -160,7 +160,7 @@ def _together(volumes: Sequence[Volume]) -> tuple[NDArray[Any], NDArray[np.int64
     if len(parts) > 1:  # of two types that no small one holds, all are promoted
         together = np.concatenate([v for _, v in parts], dtype=kind if kind in NATIVE else np.float32)
     together.setflags(write=False)  # like a single volume: otherwise Numba compiles all kernels for a second type
-    return together, np.array([first[id(volume.values)] for volume in volumes])
+    return together, np.array([first[id(volume.stored)] for volume in volumes])
 
 
 _LAID: WeakKeyDictionary[Volume, dict[float, Bricks]] = WeakKeyDictionary()
@@ -170,7 +170,7 @@ def _bricks_of(volume: Volume, sign: float) -> Bricks:
     """Bricks of a volume, laid once for as long as it lives: bake, judgement and picture use the same."""
     laid = _LAID.setdefault(volume, {})
     if sign not in laid:
-        laid[sign] = lay_bricks(volume.values, sign)
+        laid[sign] = lay_bricks(volume.stored, sign)
     return laid[sign]
 
 

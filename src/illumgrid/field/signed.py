@@ -17,9 +17,9 @@ def without_gaps(volume: Volume) -> Volume:
     """Voxels that are not finite become 0, which no surface encloses; with a warning."""
     if not volume.gaps:
         return volume
-    good = np.isfinite(volume.values)
+    good = np.isfinite(volume.stored)
     tell("finite", f"{volume.gaps} of {good.size} voxels are not finite: they became 0", stacklevel=2)
-    return volume.with_values(np.where(good, volume.values, np.float32(volume.to_stored(0.0))))
+    return volume.with_stored(np.where(good, volume.stored, np.float32(volume.to_stored(0.0))))
 
 
 def signed_pair(

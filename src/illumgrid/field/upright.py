@@ -50,7 +50,7 @@ def up_of(scene: Scene) -> str:
         level = first.volume.to_stored(otsu_threshold(first.volume, first.inside))
     except BadInput:  # constant
         return "z"
-    values = first.volume.values
+    values = first.volume.stored
     areas = sum(np.count_nonzero(first.solid(values[slab], level), axis=(0, 1)) for slab in slabs(values.shape))
     ends = areas[areas > 0][[0, -1]] / areas.max()
     return "-z" if ends[1] > FLAT and ends[0] < ROUND else "z"

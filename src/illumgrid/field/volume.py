@@ -4,7 +4,7 @@ Between voxels a volume is trilinear. Every level set in this package is a level
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Literal, Protocol
 
@@ -88,18 +88,19 @@ def slabs(shape: tuple[int, ...], most: int = AT_ONCE) -> Iterator[slice]:
         yield slice(first, min(first + rows, shape[0]))
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, init=False)
 class Volume:
-    """A scalar field h = slope · value + intercept, sampled at voxel centres, compared by identity.
+    """A scalar field h = slope · stored + intercept, sampled at voxel centres, compared by identity.
 
-    Values of 8 or 16 bits and of single precision are kept as they come, without a copy where they lie in C order; all
-    others in single precision. Where that would cost h more than `DIGITS` of its span (a large offset), or where h is
-    beyond the numbers of single precision, they are mapped onto about -1 to 1; slope and intercept undo it.
+    Values of 8 or 16 bits and of single precision are stored as they come, without a copy where they lie in C order
+    and are h; where slope and intercept are whole numbers and h fits into as many bits, h is stored. Values of other
+    types are stored in single precision. Where that would cost h more than `DIGITS` of its span (a large offset), or
+    where h is beyond the numbers of single precision, they are mapped onto about -1 to 1; slope and intercept undo it.
 
     Parameters
     ----------
     values : (nx, ny, nz) array_like of real numbers
-        At the voxel centres, axes x, y, z; kept read-only as one of `NATIVE`. At least two voxels along each axis.
+        At the voxel centres, axes x, y, z. At least two voxels along each axis.
     origin : (3,) array_like
         World position of voxel (0, 0, 0).
     spacing : (3,) array_like
@@ -107,9 +108,19 @@ class Volume:
     direction : (3, 3) array_like
         Columns are the world directions of the axes, orthonormal; a determinant of -1 mirrors.
     slope, intercept : float
-        What turns values into h, in whose units all isovalues are. After construction the slope is positive.
+        What turns the values given into h, in whose units all isovalues are.
     unit : str, optional
         Of the world coordinates, such as "mm" or "µm".
+
+    Attributes
+    ----------
+    values : (nx, ny, nz) array
+        h at the voxel centres, read-only: what is stored where the slope is 1 and the intercept 0; otherwise computed
+        each time it is asked for, in double precision.
+    stored : (nx, ny, nz) array
+        What is kept, of one of the types `NATIVE`, C order, read-only.
+    slope, intercept : float
+        What turns what is stored into h; the slope is positive.
 
     Raises
     ------
@@ -117,68 +128,98 @@ class Volume:
         If the values are not real, not 3D, too few, or all not finite; or if the placement is invalid.
     """
 
-    values: NDArray[Any]
-    origin: Floats = field(default_factory=lambda: np.zeros(3))
-    spacing: Floats = field(default_factory=lambda: np.ones(3))
-    direction: Floats = field(default_factory=lambda: np.eye(3))
-    slope: float = 1.0
-    intercept: float = 0.0
-    unit: str | None = None
+    stored: NDArray[Any]
+    origin: Floats
+    spacing: Floats
+    direction: Floats
+    slope: float
+    intercept: float
+    unit: str | None
 
-    def __post_init__(self) -> None:
-        values = np.asarray(self.values)
-        if values.dtype.kind not in "biuf":
-            raise BadInput(f"the values have dtype {values.dtype}; expected real numbers")
-        if values.ndim != 3 or min(values.shape) < 2:
-            raise BadInput(f"the values have shape {values.shape}; expected three axes of at least 2 voxels each")
-        slope, intercept = float(self.slope), float(self.intercept)
+    def __init__(
+        self,
+        values: ArrayLike | None = None,
+        origin: ArrayLike = (0.0, 0.0, 0.0),
+        spacing: ArrayLike = (1.0, 1.0, 1.0),
+        direction: ArrayLike = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
+        slope: float = 1.0,
+        intercept: float = 0.0,
+        unit: str | None = None,
+        *,
+        stored: NDArray[Any] | None = None,
+    ) -> None:
+        if (values is None) == (stored is None):
+            raise BadInput("values and `stored` came both or not at all; expected one of them: give values alone")
+        given = np.asarray(stored if values is None else values)  # `stored` comes from dataclasses.replace
+        if given.dtype.kind not in "biuf":
+            raise BadInput(f"the values have dtype {given.dtype}; expected real numbers")
+        if given.ndim != 3 or min(given.shape) < 2:
+            raise BadInput(f"the values have shape {given.shape}; expected three axes of at least 2 voxels each")
+        slope, intercept = float(slope), float(intercept)
         if not (np.isfinite([slope, intercept]).all() and slope):
             raise BadInput(f"slope and intercept are {slope} and {intercept}; expected finite numbers, the first not 0")
-        if slope < 0:
-            values, slope = -values.astype(np.float32 if values.dtype in NATIVE else float), -slope
-        values, slope, intercept = _as_kept(values, slope, intercept)
-        kept = np.ascontiguousarray(values).view()
+        kept, slope, intercept = _as_kept(*_upward(given, slope, intercept))
+        kept = np.ascontiguousarray(kept).view()
         if not any(np.isfinite(kept[slab]).any() for slab in slabs(kept.shape)):
             raise BadInput("the values are all NaN or infinite; expected finite numbers")
         kept.setflags(write=False)
-        object.__setattr__(self, "values", kept)
-        object.__setattr__(self, "slope", slope)
-        object.__setattr__(self, "intercept", intercept)
-        for name, value in zip(
-            ("origin", "spacing", "direction"), placement(self.origin, self.spacing, self.direction)
-        ):
-            value.setflags(write=False)
+        places = placement(origin, spacing, direction)
+        for place in places:
+            place.setflags(write=False)
+        names = ("stored", "slope", "intercept", "unit", "origin", "spacing", "direction")
+        for name, value in zip(names, (kept, slope, intercept, unit, *places)):
             object.__setattr__(self, name, value)
+        if not (self.plain or np.isfinite(self.extremes).all()):
+            raise BadInput(
+                f"slope and intercept are {slope} and {intercept}, which lead from values up to "
+                f"{max(map(abs, self.stored_extremes)):g} beyond the numbers of double precision; expected smaller ones"
+            )
+
+    @property
+    def values(self) -> NDArray[Any]:
+        """The field h at the voxel centres: (nx, ny, nz), read-only."""
+        if self.plain:
+            return self.stored
+        values = np.empty(self.shape)
+        for slab in slabs(self.shape):
+            values[slab] = self.in_units(self.stored[slab])
+        values.setflags(write=False)
+        return values
+
+    @property
+    def plain(self) -> bool:
+        """Whether what is stored is h."""
+        return self.slope == 1 and self.intercept == 0
 
     @property
     def shape(self) -> tuple[int, int, int]:
         """Number of voxels along x, y, z."""
-        nx, ny, nz = self.values.shape
+        nx, ny, nz = self.stored.shape
         return nx, ny, nz
 
     @cached_property
     def gaps(self) -> int:
         """How many voxels are not finite."""
-        if self.values.dtype.kind != "f":
+        if self.stored.dtype.kind != "f":
             return 0
-        return int(sum(np.count_nonzero(~np.isfinite(self.values[slab])) for slab in slabs(self.shape)))
+        return int(sum(np.count_nonzero(~np.isfinite(self.stored[slab])) for slab in slabs(self.shape)))
 
     @cached_property
     def stored_extremes(self) -> tuple[np.float64, np.float64]:
         """Lowest and highest stored value, among the finite ones."""
-        low, high = self.values.min(), self.values.max()
+        low, high = self.stored.min(), self.stored.max()
         if not (np.isfinite(low) and np.isfinite(high)):
-            good = [part[np.isfinite(part)] for part in (self.values[slab] for slab in slabs(self.shape))]
+            good = [part[np.isfinite(part)] for part in (self.stored[slab] for slab in slabs(self.shape))]
             low, high = min(part.min() for part in good if part.size), max(part.max() for part in good if part.size)
         return np.float64(low), np.float64(high)
 
     @cached_property
     def tally(self) -> tuple[NDArray[Any], NDArray[np.int64]]:
         """Stored values of 8 or 16 bits that occur, and how often each does."""
-        width, counts = self.values.itemsize, np.zeros(1 << 8 * self.values.itemsize, np.int64)
+        width, counts = self.stored.itemsize, np.zeros(1 << 8 * self.stored.itemsize, np.int64)
         for slab in slabs(self.shape):
-            counts += np.bincount(self.values[slab].reshape(-1).view(f"u{width}"), minlength=len(counts))
-        numbers = np.arange(len(counts), dtype=f"u{width}").view(self.values.dtype)
+            counts += np.bincount(self.stored[slab].reshape(-1).view(f"u{width}"), minlength=len(counts))
+        numbers = np.arange(len(counts), dtype=f"u{width}").view(self.stored.dtype)
         there = np.flatnonzero(counts)
         there = there[np.argsort(numbers[there])]
         return numbers[there], counts[there]
@@ -187,17 +228,17 @@ class Volume:
     def extremes(self) -> tuple[float, float]:
         """Lowest and highest h, among the finite ones."""
         low, high = self.stored_extremes
-        return float(self.in_units(low)), float(self.in_units(high))
+        with np.errstate(over="ignore"):
+            return float(self.in_units(low)), float(self.in_units(high))
 
     def in_units(self, stored: ArrayLike) -> Floats:
         """What h is where the stored values are these."""
-        plain = self.slope == 1 and self.intercept == 0
-        return np.asarray(stored) if plain else np.asarray(stored, float) * self.slope + self.intercept
+        return np.asarray(stored) if self.plain else np.asarray(stored, float) * self.slope + self.intercept
 
     def to_stored(self, isovalues: ArrayLike) -> Floats:
         """The stored values, in double precision, where h is these isovalues."""
-        plain = self.slope == 1 and self.intercept == 0
-        return np.asarray(isovalues) if plain else (np.asarray(isovalues, float) - self.intercept) / self.slope
+        here = np.asarray(isovalues)
+        return here if self.plain else (np.asarray(here, float) - self.intercept) / self.slope
 
     def __repr__(self) -> str:
         return (
@@ -205,9 +246,19 @@ class Volume:
             f"origin={self.origin.tolist()}, spacing={self.spacing.tolist()}, direction={self.direction.tolist()})"
         )
 
-    def with_values(self, values: NDArray[Any]) -> "Volume":
+    def with_stored(self, stored: NDArray[Any]) -> "Volume":
         """Other stored values on the same lattice, with the same map."""
-        return Volume(values, self.origin, self.spacing, self.direction, self.slope, self.intercept, self.unit)
+        return Volume(stored, self.origin, self.spacing, self.direction, self.slope, self.intercept, self.unit)
+
+
+def _upward(values: NDArray[Any], slope: float, intercept: float) -> tuple[NDArray[Any], float, float]:
+    """The same field with a positive slope; values of 8 or 16 bits are turned within their type."""
+    if slope > 0:
+        return values, slope, intercept
+    if values.dtype.newbyteorder("=") in NATIVE and values.dtype.kind in "iu":
+        ends = np.iinfo(values.dtype)  # ~v = min + max - v
+        return ~values, -slope, intercept + slope * (ends.min + ends.max)
+    return -values.astype(np.float32 if values.dtype in NATIVE else float), -slope, intercept
 
 
 DIGITS = 1e-5
@@ -220,10 +271,32 @@ def _as_kept(values: NDArray[Any], slope: float, intercept: float) -> tuple[NDAr
     if values.dtype == np.bool_:
         return values.astype(np.uint8), slope, intercept
     if native in NATIVE or native == np.float16:
-        return values.astype(np.float32 if native == np.float16 else native, copy=False), slope, intercept
+        values = values.astype(np.float32 if native == np.float16 else native, copy=False)
+        return _whole_numbers(values, slope, intercept)
     values, slope, intercept = _for_single_precision(values, slope, intercept)
     with np.errstate(over="ignore"):  # a float64 beyond float32 becomes infinite, which is handled
         return values.astype(np.float32, copy=False), slope, intercept
+
+
+def _whole_numbers(values: NDArray[Any], slope: float, intercept: float) -> tuple[NDArray[Any], float, float]:
+    """The same field without slope and intercept, where they are whole and h fits into a type as small as that of v."""
+    kind = values.dtype
+    if kind.kind == "f" or (slope, intercept) == (1, 0) or not (slope.is_integer() and intercept.is_integer()):
+        return values, slope, intercept
+    low, high = (int(end) * int(slope) + int(intercept) for end in (values.min(), values.max()))
+    for other in (kind, np.dtype(f"u{kind.itemsize}"), np.dtype(f"i{kind.itemsize}")):
+        if np.iinfo(other).min <= low and high <= np.iinfo(other).max:
+            whole = np.empty(values.shape, other)
+            for slab in slabs(values.shape):
+                whole[slab] = values[slab].astype(np.int64) * int(slope) + int(intercept)
+            return whole, 1.0, 0.0
+    return values, slope, intercept
+
+
+def single_precision_holds(low: float, high: float) -> bool:
+    """Whether rounding to single precision costs values from `low` to `high` at most `DIGITS` of half their span."""
+    largest, half = max(abs(low), abs(high)), high / 2 - low / 2  # halves: the whole may overflow
+    return largest * float(np.finfo(np.float32).eps) / 4 <= DIGITS * half and 1e-30 <= largest <= 1e30
 
 
 def _for_single_precision(values: NDArray[Any], slope: float, intercept: float) -> tuple[NDArray[Any], float, float]:
@@ -235,7 +308,7 @@ def _for_single_precision(values: NDArray[Any], slope: float, intercept: float) 
     low, high = (float(f(wide, where=good, initial=i)) for f, i in ((np.min, np.inf), (np.max, -np.inf)))
     largest, span = max(abs(low), abs(high)), high / 2 - low / 2  # halves: the whole may overflow
     fits = largest * float(np.finfo(np.float32).eps) / 4 <= DIGITS * span
-    if span == 0 or (fits and 1e-30 <= largest <= 1e30):
+    if span == 0 or single_precision_holds(low, high):
         return values, slope, intercept
     with np.errstate(over="ignore"):
         if np.array_equal(wide[good].astype(np.float32), wide[good]):
@@ -249,8 +322,8 @@ def histogram(volume: Volume, bins: int, ends: tuple[float, float] | None = None
     """Counts of the stored values in even bins between stored `ends`, by default the extremes, and the bins' edges."""
     # np.float64, not float: for float32 values NumPy would compute the edges in float32, too coarse far from 0.
     low, high = (np.float64(x) for x in (volume.stored_extremes if ends is None else ends))
-    if volume.values.dtype.kind == "f":
-        return np.histogram(volume.values, bins, (low, high))  # it leaves out what is not finite
+    if volume.stored.dtype.kind == "f":
+        return np.histogram(volume.stored, bins, (low, high))  # it leaves out what is not finite
     values, counts = volume.tally  # many times faster than to look at every voxel
     _, edges = np.histogram(values[:0], bins, (low, high))
     found, _ = np.histogram(values, bins, (low, high), weights=counts)
@@ -261,7 +334,7 @@ def finite(volume: Volume, inside: Side) -> Volume:
     """Replace non-finite values, with a warning: NaN by the value farthest outside, ±inf by the finite extremes."""
     if not volume.gaps:
         return volume
-    good = np.isfinite(volume.values)
+    good = np.isfinite(volume.stored)
     low, high = (float(x) for x in volume.stored_extremes)
     outermost = low if UPWARD[inside] > 0 else high
     lowest, highest = volume.extremes
@@ -273,7 +346,7 @@ def finite(volume: Volume, inside: Side) -> Volume:
         f"{farthest:g}, the value farthest outside, infinities became {lowest:g} and {highest:g}",
         stacklevel=2,
     )
-    return volume.with_values(np.nan_to_num(volume.values, nan=outermost, posinf=high, neginf=low))
+    return volume.with_stored(np.nan_to_num(volume.stored, nan=outermost, posinf=high, neginf=low))
 
 
 def smooth(volume: Volume, sigma: float) -> Volume:
@@ -285,7 +358,7 @@ def smooth(volume: Volume, sigma: float) -> Volume:
         return volume
     from scipy.ndimage import gaussian_filter
 
-    return volume.with_values(gaussian_filter(volume.values, sigma, output=np.float32, mode="nearest"))
+    return volume.with_stored(gaussian_filter(volume.stored, sigma, output=np.float32, mode="nearest"))
 
 
 class Shaped(Protocol):
@@ -322,7 +395,7 @@ def interpolate(volume: Volume, index: Floats) -> Floats:
 def _interpolate_stored(volume: Volume, index: Floats) -> Floats:
     from scipy.ndimage import map_coordinates
 
-    return np.asarray(map_coordinates(volume.values, index.T, output=np.float64, order=1, mode="nearest"))
+    return np.asarray(map_coordinates(volume.stored, index.T, output=np.float64, order=1, mode="nearest"))
 
 
 def cell_gradient(volume: Volume, index: Floats) -> Floats:
@@ -331,7 +404,7 @@ def cell_gradient(volume: Volume, index: Floats) -> Floats:
     result = np.zeros((len(index), 3))
     for corner in np.ndindex(2, 2, 2):
         weight = np.where(corner, f, 1 - f)
-        value = volume.values[tuple((cell + corner).T)]
+        value = volume.stored[tuple((cell + corner).T)]
         for axis in range(3):
             sign = 1.0 if corner[axis] else -1.0
             result[:, axis] += sign * (weight[:, axis - 1] * weight[:, axis - 2]) * value
@@ -357,7 +430,7 @@ def central_differences(values: NDArray[Any], index: Floats) -> Floats:
 
 def smooth_gradient(volume: Volume, index: Floats) -> Floats:
     """Central differences of the stored values, interpolated: (n, 3), per world unit, along the volume's axes."""
-    return central_differences(volume.values, index) / volume.spacing
+    return central_differences(volume.stored, index) / volume.spacing
 
 
 def unit(vectors: Floats) -> Floats:
@@ -400,6 +473,6 @@ def project(volume: Volume, index: Floats, isovalues: Floats) -> tuple[Floats, N
 
 def _compilable(volume: Volume) -> tuple[NDArray[Any], tuple[float, ...]]:
     """Values and spacing for a kernel, always of the same two types: otherwise Numba compiles again."""
-    values = volume.values.view()
+    values = volume.stored.view()
     values.flags.writeable = False
     return values, tuple(volume.spacing.tolist())

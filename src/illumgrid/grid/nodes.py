@@ -25,7 +25,7 @@ def _any_corner(voxels: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 def _crossed_cells(field: Field, rows: slice) -> NDArray[np.bool_]:
     """Voxel cells (rows, ny - 1, nz - 1) through which some level set of the field's range passes."""
-    values, (low, high) = field.volume.values[rows.start : rows.stop + 1], field.stored_range
+    values, (low, high) = field.volume.stored[rows.start : rows.stop + 1], field.stored_range
     return _any_corner(values >= low) & _any_corner(values <= high)
 
 

@@ -45,7 +45,7 @@ def bins(samples: Samples, nodes: Nodes) -> Bins:
     good = np.flatnonzero(lit)
     good = good[np.lexsort((samples.queries.id[good], flat[good]))]
     slope = np.zeros(len(good))
-    slopes(volume.values, volume.spacing, spec.spacing, world_to_index(volume, samples.queries.point[good]), slope)
+    slopes(volume.stored, volume.spacing, spec.spacing, world_to_index(volume, samples.queries.point[good]), slope)
     scale, shift = _level_units(nodes)
     place = np.column_stack(
         [
@@ -111,7 +111,7 @@ class Bilateral:
             some = np.zeros((len(flat), light.shape[1]), np.float32)
             bar, many = np.full(len(flat), np.inf, np.float32), np.zeros(len(flat), np.float32)
             fill(
-                volume.values, volume.spacing, field.upward, field.stored_range, scale, shift, *sorted_,
+                volume.stored, volume.spacing, field.upward, field.stored_range, scale, shift, *sorted_,
                 np.array(spec.shape), ratio, at, some, bar, many,
             )  # fmt: skip
             light[flat], error[flat], support[flat] = some, bar, many

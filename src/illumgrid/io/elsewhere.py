@@ -38,21 +38,28 @@ class Source:
     side: Side | None
     blur: float
 
-    def volumes(self) -> dict[int | None, Volume]:
-        """The volumes by label, or that of the file under None."""
+    def volumes(self, folded: bool = False) -> dict[int | None, Volume]:
+        """The volumes by label, or that of the file under None.
+
+        With `folded` in single precision, slope and intercept of the file applied: so they were kept before there was
+        `Volume.stored`.
+        """
         if self.labels:
             each = {label: read_volume(self.path, **self.reading, label=label) for label in self.labels}
             return {label: smooth(volume, self.blur) for label, volume in each.items()}
         volume = read_volume(self.path, **self.reading)
+        if folded:
+            place = volume.origin, volume.spacing, volume.direction
+            volume = Volume(volume.values.astype(float), *place, unit=volume.unit)
         volume = without_gaps(volume) if self.side is None else finite(volume, self.side)
         return {None: smooth(volume, self.blur)}
 
 
 def digest(volume: Volume) -> str:
     """SHA-256 of the values, their type and their map to units."""
-    seen = hashlib.sha256(f"{volume.values.dtype.name} {volume.shape} {volume.slope!r} {volume.intercept!r}".encode())
+    seen = hashlib.sha256(f"{volume.stored.dtype.name} {volume.shape} {volume.slope!r} {volume.intercept!r}".encode())
     for slab in slabs(volume.shape):
-        seen.update(volume.values[slab].data)
+        seen.update(volume.stored[slab].data)
     return seen.hexdigest()
 
 
@@ -80,10 +87,9 @@ def fields_again(about: Mapping[str, Any], folder: Path, digests: Sequence[str])
     source = Source(path, reading, about["labels"], about["side"], float(about["blur"]))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # they were said when the run was made, and are in its record
-        found = list(source.volumes().values())
-    found = found if len(found) == len(digests) else found * len(digests)  # both signs of one volume
-    if [digest(volume) for volume in found] != list(digests):
-        raise BadInput(
-            f"its field is in {path} (--no-embed), which has changed since it was lit; put the old file back"
-        )
-    return found
+        for folded in (False, True):
+            found = list(source.volumes(folded).values())
+            found = found if len(found) == len(digests) else found * len(digests)  # both signs of one volume
+            if [digest(volume) for volume in found] == list(digests):
+                return found
+    raise BadInput(f"its field is in {path} (--no-embed), which has changed since it was lit; put the old file back")

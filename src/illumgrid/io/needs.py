@@ -71,7 +71,7 @@ def check_run(scene: "Scene", specs: Sequence[GridSpec], levels: "Levels", densi
 
 def check_surface(field: "Field", isovalue: float, todo: str) -> None:
     """Refuse the extraction of an isosurface whose triangles do not fit; counts what it crosses."""
-    values, level = field.volume.values, float(field.volume.to_stored(isovalue))
+    values, level = field.volume.stored, float(field.volume.to_stored(isovalue))
     crossed = 0
     for k in range(0, len(values), 16):  # some slices at a time: what is compared takes memory, too
         above = values[k : k + 17] >= level
@@ -82,7 +82,7 @@ def check_surface(field: "Field", isovalue: float, todo: str) -> None:
 
 def _share(field: "Field") -> float:
     """Share of the nodes through which isosurfaces of the range pass, about."""
-    values = field.volume.values.ravel(order="K")
+    values = field.volume.stored.ravel(order="K")
     some = values[:: max(1, len(values) // _SOME)]
     low, high = sorted(field.stored_range)
     return float(((some >= low) & (some <= high)).mean())

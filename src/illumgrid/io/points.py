@@ -87,4 +87,4 @@ def density_of_file(
             raise BadInput(f"cell is {cell!r}; expected {FILE!r} or three lengths")
         cell = cloud.lengths()
     volume = density(cloud.points, spacing=spacing, sigma=sigma, weights=cloud.weights, cell=cell)
-    return Volume(volume.values, volume.origin, volume.spacing, unit=cloud.unit)
+    return Volume(volume.stored, volume.origin, volume.spacing, unit=cloud.unit)

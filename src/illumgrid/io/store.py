@@ -240,7 +240,7 @@ def _describe(stored: Stored) -> Record:
         | {"slope": f.volume.slope, "intercept": f.volume.intercept, "unit": f.volume.unit}
         | {"albedo": f.material.albedo.tolist(), "emission": f.material.emission.tolist()}
         | ({"transmission": f.material.transmission} if f.material.transmission else {})
-        | {"type": f.volume.values.dtype.name, "extremes": f.volume.extremes}
+        | {"type": f.volume.stored.dtype.name, "extremes": f.volume.extremes}
         | {"histogram": histogram(f.volume, BINS)[0].tolist()}
         | lattice(f.volume)
         for f in stored.scene.fields
@@ -442,7 +442,7 @@ def _write_exr(path: Path, stored: Stored) -> None:
         parts[f"light/{f.name}"] = of_grid(grid)
         parts |= {f"rows/{k}/{f.name}": of_grid(row) for k, row in enumerate(grid.rows)}
         if stored.source is None:
-            parts[f"field/{f.name}"] = exr.of_field(f.volume.values)
+            parts[f"field/{f.name}"] = exr.of_field(f.volume.stored)
     for quad, wall in zip(stored.scene.quads, stored.walls):
         turned = split(wall) | {"support": wall.support}
         parts[f"wall/{quad.name}"] = images({channel: array.swapaxes(0, 2) for channel, array in turned.items()})

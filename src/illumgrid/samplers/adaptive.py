@@ -31,7 +31,7 @@ def _cells_in_range(field: Field) -> Iterator[tuple[Floats, Floats, Floats]]:
 
     The slope is the mean of |∇h| over the 8 Gauss points of the trilinear cell: at the centre alone it may vanish.
     """
-    values, (lowest, highest) = field.volume.values, field.stored_range
+    values, (lowest, highest) = field.volume.stored, field.stored_range
     rows = max(1, _CELLS // (values.shape[1] * values.shape[2]))
     shares = 0.5 + np.array([-0.5, 0.5]) / 3**0.5
     weight = np.array([(1 - shares), shares])  # (end, Gauss point)
@@ -81,9 +81,9 @@ def critical_values(field: Field) -> tuple[Floats, NDArray[np.int64]]:
     passes, changes the Euler characteristic by the alternating sum of the cells that it completes, which is 0 unless
     the voxel is critical. Equal values are ordered by their position in the array, so that a plateau counts once.
     """
-    values = np.pad(np.float32(field.upward) * field.volume.values.astype(np.float32), 1, constant_values=-np.inf)
+    values = np.pad(np.float32(field.upward) * field.volume.stored.astype(np.float32), 1, constant_values=-np.inf)
     low, high = field.stored_range
-    within = (field.volume.values >= low) & (field.volume.values <= high)
+    within = (field.volume.stored >= low) & (field.volume.stored <= high)
     own = np.flatnonzero(np.pad(within, 1))
     stride = np.array([values.shape[1] * values.shape[2], values.shape[2], 1])
     steps = np.array(list(product((-1, 0, 1), repeat=3)))

@@ -110,7 +110,7 @@ def outline_of(scene: Scene, row: Floats) -> Floats:
     for field, isovalue in zip(scene.fields, row):
         level = np.float64(field.volume.to_stored(isovalue))
         for axis in range(3):
-            ends = _column_ends(np.moveaxis(field.volume.values, axis, 2), level, field.upward)
+            ends = _column_ends(np.moveaxis(field.volume.stored, axis, 2), level, field.upward)
             found.append(index_to_world(field.volume, np.insert(ends[:, :2], axis, ends[:, 2], axis=1)))
     if not sum(map(len, found)):
         found = [box_corners(f.volume) for f in scene.fields]

@@ -121,7 +121,7 @@ def _asked(scene: Scene, on_voxels: bool) -> Queries:
     """Queries on the voxels of field 0 in the middle of its values, or uniform by area on three of its level sets."""
     volume = scene.fields[0].volume
     if on_voxels:
-        return Queries.at(scene, index_to_world(volume, np.argwhere(np.abs(volume.values - 0.5) < 0.25)))
+        return Queries.at(scene, index_to_world(volume, np.argwhere(np.abs(volume.stored - 0.5) < 0.25)))
     queries = join_queries(list(on_level_sets(scene, [0.41, 0.5, 0.59], 0, points=60)))
     return queries[np.flatnonzero(queries.normal.any(axis=1))]
 

@@ -11,7 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from illumgrid.errors import BadInput
-from illumgrid.field.volume import Floats, Lattice, Volume, index_to_world, interpolate, world_to_index
+from illumgrid.field.volume import (
+    Floats,
+    Lattice,
+    Volume,
+    index_to_world,
+    interpolate,
+    single_precision_holds,
+    world_to_index,
+)
 from illumgrid.tone import curve, encode_srgb
 
 if TYPE_CHECKING:
@@ -94,14 +102,14 @@ def field_alone(volume: Volume, name: str) -> Points:
     """The values of a field without light, as the array "field"."""
 
     def at(these: set[str], index: Index) -> Arrays:
-        return {"field": volume.in_units(volume.values[tuple(index.T)])}
+        return {"field": volume.in_units(volume.stored[tuple(index.T)])}
 
     return Points(name, volume, {"field": _kind(volume)}, at)
 
 
 def _kind(volume: Volume) -> np.dtype[Any]:
     """Where the field has an offset or scale that single precision does not hold, nor does the file."""
-    return np.dtype(np.float32 if volume.slope == 1 and volume.intercept == 0 else np.float64)
+    return np.dtype(np.float32 if volume.plain or single_precision_holds(*volume.extremes) else np.float64)
 
 
 def _at(light: "Illumination", number: int, world: Floats, names: set[str]) -> dict[str, NDArray[Any]]:

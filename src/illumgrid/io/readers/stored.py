@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from illumgrid.errors import BadInput
-from illumgrid.field.volume import Floats, Volume
+from illumgrid.field.volume import NATIVE, Floats, Volume
 from illumgrid.io.readers.limits import AS_FLOAT, check_axes, check_memory
 from illumgrid.io.readers.windows import Span, take
 
@@ -163,13 +163,12 @@ def place(stored: Stored) -> tuple[Volume, tuple[Note, ...]]:
         )
     u, _, v = np.linalg.svd(direction)
     exact = direction if skew < 1e-14 else u @ v
-    values = stored.values
-    if stored.slope != 1 or stored.intercept != 0:
-        check_memory(values.size * (8 + AS_FLOAT))
-        values = values * np.float64(stored.slope) + np.float64(stored.intercept)
-    else:
-        check_memory(values.size * AS_FLOAT)
-    return Volume(values, stored.origin, spacing, exact, unit=stored.unit), notes
+    small = stored.values.dtype.newbyteorder("=") in NATIVE
+    check_memory(stored.values.size * (stored.values.itemsize if small else 8 + AS_FLOAT))
+    volume = Volume(
+        stored.values, stored.origin, spacing, exact, slope=stored.slope, intercept=stored.intercept, unit=stored.unit
+    )
+    return volume, notes
 
 
 _SHEARED = (

@@ -16,7 +16,7 @@ _LARGE = 1 << 26  # voxels; extraction holds each in single precision, and milli
 
 def too_large_for_meshes(scene: "Scene") -> bool:
     """Whether rays draw a scene in much less memory than triangles."""
-    return sum(field.volume.values.size for field in scene.fields) > _LARGE
+    return sum(field.volume.stored.size for field in scene.fields) > _LARGE
 
 
 def choose_engine(name: str) -> tuple[str, str]:

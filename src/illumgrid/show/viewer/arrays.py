@@ -77,7 +77,7 @@ def field_steps(
     their span on either side.
     """
     low, high = sorted(sign * float(x) for x in volume.stored_extremes)
-    values, step, clamped = volume.values, 1.0, False
+    values, step, clamped = volume.stored, 1.0, False
     whole = high - low <= _STEPS and max(abs(low), abs(high)) < 2**24 and _whole(values)
     if not whole:
         clamped = (limits[1] - limits[0]) * _STEPS < _FINE * (high - low)
