@@ -28,6 +28,7 @@ MOST_ROWS = 256
 """Rows of levels in one request, each of which needs meshes of its own."""
 NO_ROULETTE = 1 << 20
 STEP = np.uint64(0x9E3779B97F4A7C15)
+DTYPES = {mi.Float: np.float32, mi.UInt64: np.uint64, mi.UInt32: np.uint32, mi.Bool: np.bool_}
 
 
 class Numbers(mi.Sampler):
@@ -35,7 +36,7 @@ class Numbers(mi.Sampler):
 
     def __init__(self, key):
         super().__init__(mi.Properties())
-        self.key, self.count = mi.UInt64(key), mi.UInt64(0)
+        self.key, self.count = lanes(mi.UInt64, key), mi.UInt64(0)
 
     def next_1d(self, active=True):
         """A uniform number: the finalizer of `illumgrid.rng.mix`, whose upper 24 bits single precision holds."""
@@ -50,9 +51,23 @@ class Numbers(mi.Sampler):
         return mi.Point2f(self.next_1d(), self.next_1d())
 
 
+def lanes(kind, array):
+    """Numbers (n,) as an array of Mitsuba's, at an address that is a multiple of 128.
+
+    Memory of NumPy is taken over as it lies, and code is compiled anew for each combination of addresses that are
+    multiples of the width of a vector register and that are not.
+    """
+    values = np.asarray(array, DTYPES[kind]).reshape(-1)
+    room = np.empty(values.nbytes + 128, np.uint8)
+    first = -room.ctypes.data % 128
+    own = room[first : first + values.nbytes].view(values.dtype)
+    own[:] = values
+    return kind(own)
+
+
 def vectors(kind, array):
     """Rows of (n, 3) as Mitsuba's vectors."""
-    return kind(*(mi.Float(np.ascontiguousarray(column, np.float32)) for column in array.T))
+    return kind(*(lanes(mi.Float, column) for column in array.T))
 
 
 def color(value):
@@ -261,8 +276,8 @@ class MitsubaTracer:
             return np.zeros((0, 3))
         at = mi.Interaction3f(0.0, 0.0, [], vectors(mi.Point3f, own.point), vectors(mi.Normal3f, own.facing))
         n, wo = vectors(mi.Normal3f, own.normal), vectors(mi.Vector3f, d)
-        active = mi.Bool(traced)
-        ds, light = scene.sample_emitter_direction(at, mi.Point2f(*(mi.Float(x.astype(np.float32)) for x in u)), True)
+        active = lanes(mi.Bool, traced)
+        ds, light = scene.sample_emitter_direction(at, mi.Point2f(*(lanes(mi.Float, x) for x in u)), True)
         cosine = dr.maximum(dr.dot(n, ds.d), 0) / dr.pi
         asked = (ds.pdf > 0) & (dr.dot(at.n, ds.d) > 0)
         total = dr.select(asked, light * cosine * dr.select(ds.delta, 1, ds.pdf / (ds.pdf + cosine)), 0)
@@ -304,10 +319,10 @@ class MitsubaTracer:
 
 
 def _set_mesh(params, vertices, faces, normals, there=True, prefix=""):
-    params[prefix + "vertex_positions"] = mi.Float(np.ravel(vertices).astype(np.float32))
-    params[prefix + "faces"] = mi.UInt32(np.ravel(faces).astype(np.uint32))
+    params[prefix + "vertex_positions"] = lanes(mi.Float, vertices)
+    params[prefix + "faces"] = lanes(mi.UInt32, faces)
     if normals is not None:
-        params[prefix + "vertex_normals"] = mi.Float(np.ravel(normals).astype(np.float32))
+        params[prefix + "vertex_normals"] = lanes(mi.Float, normals)
 
 
 class _Lanes:

@@ -8,14 +8,12 @@ from illumgrid_mitsuba.sky import picture, texel_directions
 import illumgrid as ig
 from illumgrid.field.upright import sky_axes
 from illumgrid.testing import BackendTests
-from illumgrid.transport.analytic import CASES
 
 ALBEDO = np.array([0.8, 0.6, 0.4])
 
 
 class TestMitsuba(BackendTests):
     stage = Mitsuba
-    cases = tuple(case for case in CASES if case.__name__ != "plane")  # 200 meshes, for each of which code is compiled
 
 
 def ball(size=16, radius=0.6):

@@ -5,6 +5,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from illumgrid.compiled import njit
 from illumgrid.errors import BadInput
+from illumgrid.field.cells import Brick
 from illumgrid.field.lattice import GridSpec
 from illumgrid.field.volume import Floats, Volume
 
@@ -90,6 +91,25 @@ def deposit(points: Floats, weights: Floats, lattice: GridSpec, sigma: float, pe
     values = np.zeros(lattice.shape, np.float32)
     gaussian_filter(grid, width, output=values, mode="wrap" if periodic else "constant", truncate=REACH)
     return Volume(values, lattice.origin, lattice.spacing)
+
+
+def deposit_in(brick: Brick, points: Floats, weights: Floats, lattice: GridSpec, sigma: float) -> Volume:
+    """Density of points (n, 3), world units, in a periodic cell whose edges are not all upright.
+
+    Images of the points are shared among voxels within and around the `lattice` of its brick, whose rim is then cut
+    off. The total is kept as exactly as elsewhere: a row of voxels shares out a point's whole weight wherever its image
+    lies between them, so that rows, and then planes, add up though images do not lie as the point does.
+    """
+    more = np.ceil(REACH * sigma / lattice.spacing).astype(int) + 2
+    shape = lattice.shape + 2 * more
+    wide = GridSpec(
+        (int(shape[0]), int(shape[1]), int(shape[2])), lattice.origin - more * lattice.spacing, lattice.spacing
+    )
+    at, mass = brick.images(points, weights, (more - 1) * lattice.spacing)
+    values = deposit(at, mass, wide, sigma, periodic=False).stored
+    inner = tuple(slice(m, m + n) for m, n in zip(more, lattice.shape))
+    axes = brick.axes.T
+    return Volume(np.ascontiguousarray(values[inner]), axes @ lattice.origin, lattice.spacing, axes)
 
 
 @njit()

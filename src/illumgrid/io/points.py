@@ -4,15 +4,17 @@ import os
 from collections.abc import Sequence
 from math import prod
 
+import numpy as np
 from numpy.typing import ArrayLike
 
 from illumgrid.errors import BadInput
-from illumgrid.field.deposit import checked_points, deposit, lattice_for
+from illumgrid.field.cells import Brick
+from illumgrid.field.deposit import checked_points, deposit, deposit_in, lattice_for
 from illumgrid.field.volume import Volume
 from illumgrid.io import needs
 
 FILE = "file"
-"""In place of the lengths of a periodic cell: those that the file of the points says."""
+"""In place of a periodic cell: the one that the file of the points says."""
 
 
 def density(
@@ -21,7 +23,7 @@ def density(
     spacing: float | Sequence[float],
     sigma: float,
     weights: ArrayLike | None = None,
-    cell: float | Sequence[float] | None = None,
+    cell: ArrayLike | None = None,
 ) -> Volume:
     """Density of points: point masses spread by a Gaussian, as a field to light.
 
@@ -35,9 +37,11 @@ def density(
         Standard deviation of the Gaussian, world units. It ends at 4 sigma; 0 leaves the points as narrow as a voxel.
     weights : (n,) array_like, optional
         Mass of each point, by default 1; charges may be negative.
-    cell : float or (3,) sequence of float, optional
-        Lengths of a periodic cell with right angles, which begins at 0. Points outside enter at the opposite face. By
-        default the points stand alone, and the volume reaches 4 sigma beyond them.
+    cell : float, (3,) or (3, 3) array_like, optional
+        Periodic cell that begins at 0: its lengths where its angles are right and its edges along x, y and z, or any
+        three edges, row by row. Points outside enter at the opposite face. The field of a cell without right angles
+        fills the brick of the same volume and repetition: see `illumgrid.field.cells`. By default the points stand
+        alone, and the volume reaches 4 sigma beyond them.
 
     Returns
     -------
@@ -50,9 +54,12 @@ def density(
         If an argument is not as said, or the voxels need more memory than is free.
     """
     at, mass = checked_points(points, weights)
-    lattice = lattice_for(at, spacing, sigma, cell)
+    brick = None if cell is None or np.ndim(cell) != 2 else Brick.of(cell)
+    lattice = lattice_for(at, spacing, sigma, cell if brick is None else brick.sides)
     todo = "choose a larger spacing, or leave far points out"
     needs.check("the density", needs.TO_DEPOSIT * prod(lattice.shape), todo)
+    if brick is not None:
+        return deposit_in(brick, at, mass, lattice, sigma)
     return deposit(at, mass, lattice, sigma, cell is not None)
 
 
@@ -63,7 +70,7 @@ def density_of_file(
     sigma: float,
     weights: str | None = None,
     columns: Sequence[str] | None = None,
-    cell: str | float | Sequence[float] | None = None,
+    cell: str | ArrayLike | None = None,
 ) -> Volume:
     """Density of the points in a file: see `density`, and `illumgrid.io.readers.points.read_points`.
 
@@ -76,15 +83,15 @@ def density_of_file(
         Column of the masses, by name or by number from 0.
     columns : (3,) sequence of str, optional
         Columns of the coordinates.
-    cell : "file", float or (3,) sequence of float, optional
-        Lengths of a periodic cell, or the cell that the file says.
+    cell : "file", float, (3,) or (3, 3) array_like, optional
+        A periodic cell, or the one that the file says.
     """
     from illumgrid.io.readers.points import read_points
 
     cloud = read_points(path, weights=weights, columns=columns)
     if isinstance(cell, str):
         if cell != FILE:
-            raise BadInput(f"cell is {cell!r}; expected {FILE!r} or three lengths")
-        cell = cloud.lengths()
+            raise BadInput(f"cell is {cell!r}; expected {FILE!r}, three lengths or three edges")
+        cell = cloud.periodic()
     volume = density(cloud.points, spacing=spacing, sigma=sigma, weights=cloud.weights, cell=cell)
-    return Volume(volume.stored, volume.origin, volume.spacing, unit=cloud.unit)
+    return Volume(volume.stored, volume.origin, volume.spacing, volume.direction, unit=cloud.unit)

@@ -36,18 +36,13 @@ class Cloud:
     """(3, 3): its edges, row by row."""
     unit: str | None = None
 
-    def lengths(self) -> list[float]:
-        """The sides of the cell, which must lie along the axes of the world."""
+    def periodic(self) -> list[float] | Floats:
+        """The cell: its three lengths where its edges lie along the axes of the world, or its edges (3, 3)."""
         if self.cell is None or not self.cell.any():
             raise BadInput("the file of the points has no periodic cell; expected one; give three lengths")
         sides = np.diag(self.cell)
-        if np.abs(self.cell - np.diag(sides)).max() > 1e-4 * np.abs(sides).max():
-            edges = ", ".join(str(edge.round(4).tolist()) for edge in self.cell)
-            raise BadInput(
-                f"the edges of the periodic cell are {edges}; expected right angles along x, y, z; leave the cell out, "
-                "or convert the file to a rectangular cell"
-            )
-        return [float(side) for side in sides]
+        upright = np.abs(self.cell - np.diag(sides)).max() <= 1e-4 * np.abs(sides).max()
+        return [float(side) for side in sides] if upright else self.cell
 
 
 def read_points(
