@@ -3,7 +3,8 @@
 The same kernels trace the same visible points of a view that no run has seen. Errors are relative root mean squares of
 the irradiance over the pixels, against paths of every length from other seeds; half the difference of two such
 references is their own error, whose square is taken off. Seconds are those of all processors, scaled to a picture of
-640 x 480.
+640 x 480. Also: seconds to a half and a tenth of the lookup's error; FLIP of the pictures against the converged one;
+and what residual paths would bring, which go on where the others end and pay the difference.
 
     python benchmarks/exact.py [--only NAME] [--out FOLDER]
 """
@@ -17,9 +18,9 @@ import numpy as np
 
 import illumgrid as ig
 from illumgrid.field.volume import smooth
-from illumgrid.show import fit_camera
+from illumgrid.show import fit_camera, render
 from illumgrid.show.engines import software
-from illumgrid.show.exact import Exact, Gathering, looked_up, steps_to
+from illumgrid.show.exact import Exact, Gathering, looked_up, steps_to, tracer_of
 from illumgrid.show.picture import _shown
 
 VOLUMES = Path("/data")
@@ -101,7 +102,52 @@ def measure(name, scene, grid, paths):
             {"rays": rays, "seconds": seconds * scale, "error": error(found)}
             for rays, seconds, found in gathered(light, exact)
         ]
+        row[f"{kind}, seconds to"] = {s: reached(row[kind], s * row["lookup"]["error"][0]) for s in (0.5, 0.1)}
+    row["residual"] = residual(made, hits, truth.mean())
+    row["FLIP"] = flip(made, row["resting"])
     return row
+
+
+def reached(steps, error):
+    """Seconds at which an error is reached, along straight lines in logarithms; None if it is not."""
+    for before, after in zip(steps, steps[1:]):
+        (e, f), (s, t) = (np.log([x["error"][0] for x in (before, after)]), np.log([x["seconds"] for x in (before, after)]))
+        if f <= np.log(error) < e:
+            return float(np.exp(s + (t - s) * (e - np.log(error)) / (e - f)))
+    return steps[0]["seconds"] if steps[0]["error"][0] <= error else None
+
+
+def residual(made, hits, mean):
+    """What going on brings, path by path: mean and standard deviation over the mean light, and seconds of both."""
+    rows = np.concatenate([hits.lit(k) for k in range(made.surfaces)])[::2]
+    asked, found, spent = made.asked(hits, rows, np.arange(len(rows), dtype=np.uint64)), [], []
+    for full in (False, True):
+        solve, _ = tracer_of(made.shown.light, full)
+        solve(made.asked(hits, rows[:8], np.arange(8, dtype=np.uint64)), range(1), 5)
+        begun = time.process_time()
+        found.append([solve(asked, range(k, k + 1), 5)[0].astype(float) for k in range(8)])
+        spent.append(time.process_time() - begun)
+    short, whole = np.array(found) / mean
+    more = whole - short
+    spread = np.square(more - more.mean(axis=0)).mean() * 8 / 7
+    ray = np.square(short - short.mean(axis=0)).mean() * 8 / 7
+    return {"bias": float(-more.mean()), "deviation": float(np.sqrt(spread)), "of a ray": float(np.sqrt(ray)),
+            "seconds": spent}  # fmt: skip
+
+
+def flip(made, steps):
+    """FLIP of the lookup, and of as many rays as two processors trace in 10 s at 640 x 480; against the converged."""
+    import flip_evaluator
+
+    rays = max(1, int(20.0 * steps[-1]["rays"] / steps[-1]["seconds"]))
+    options = {"isovalue": float(made.shown.row[0]), "width": SIZE[0], "height": SIZE[1], "camera": made.camera}
+    kinds = {"truth": Exact(TRUTH, True), "lookup": None, "after 10 s": Exact(rays)}
+    drawn = {
+        name: render(made.shown.light, exact=exact, **options).astype(np.float32) / np.float32(255)
+        for name, exact in kinds.items()
+    }
+    off = {n: float(flip_evaluator.evaluate(drawn["truth"], drawn[n], "LDR", applyMagma=False)[1]) for n in list(kinds)[1:]}
+    return {"rays": rays, **off}
 
 
 def main():

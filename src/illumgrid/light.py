@@ -114,6 +114,24 @@ class Illumination:
         lights = tuple(replace(o, coefficients=new) if o is found[0] else o for o in self.scene.lights)
         return self._shown_as(replace(self.scene, lights=lights), self.weights)
 
+    def looking(
+        self, field: str | None = None, *, roughness: float | None = None, translucent: float = 0.0
+    ) -> "Illumination":
+        """The same light, with a clear coat over a field or a surface that is seen through: pictures only.
+
+        Parameters
+        ----------
+        field : str, optional
+            By default the first.
+        roughness, translucent : float, optional
+            As in `Material`.
+        """
+        number = self.scene.number_of(field)
+        old = self.scene.fields[number]
+        material = replace(old.material, roughness=roughness, translucent=translucent)
+        fields = (*self.scene.fields[:number], replace(old, material=material), *self.scene.fields[number + 1 :])
+        return replace(self, scene=replace(self.scene, fields=fields))
+
     def _shown_as(self, scene: Scene, weights: Mapping[str, float]) -> "Illumination":
         layers = layers_of(scene)
         whole = scene is self.scene and all(weight == 1.0 for weight in weights.values()) and not self.weights

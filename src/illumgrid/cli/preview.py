@@ -11,6 +11,7 @@ import typer
 
 from illumgrid.cli.lights import SkyImage, Turn, Weights, relit
 from illumgrid.cli.long import loaded
+from illumgrid.cli.looks import Look, looking
 from illumgrid.cli.terminal import progress_bars, say
 from illumgrid.errors import BadInput, shown, shown_range
 
@@ -122,6 +123,7 @@ def preview(
     weights: Weights = None,
     sky: SkyImage = None,
     turn: Turn = 0.0,
+    look: Look = None,
     engine: Annotated[str, typer.Option(help="Rendering engine: auto, egl, osmesa, software.")] = "auto",
 ) -> None:
     """Draw an isosurface of a finished run, several side by side, or a sweep through the range."""
@@ -138,20 +140,24 @@ def preview(
     several = None if isovalues is None else _numbers(isovalues)
     engine_used, why = show.choose_engine(engine if exact is None else "software")
     gathered = None if exact is None else _exact(exact)
-    light = relit(loaded(folder), weights, sky, turn)
+    light = looking(relit(loaded(folder), weights, sky, turn), look)
     if engine == "auto" and engine_used != "software" and show.too_large_for_meshes(light.scene):
         engine_used, why = "software", "the field is large, and rays need no mesh of it"
+    if engine_used != "software" and any(not f.material.plain for f in light.scene.fields):
+        if engine != "auto":
+            raise BadInput(f"--engine is {engine}; expected software: coats and what is seen through are drawn by rays")
+        engine_used, why = "software", "coats and what is seen through are drawn by rays"
     options: dict[str, Any] = {"background": background, "engine": engine_used, "stops": exposure}
     if size != SIZE:
         options |= {"width": size[0], "height": size[1]}
-    look: dict[str, Any] = {"view": view, "zoom": zoom, "up": up, "roll": roll}
+    seen_from: dict[str, Any] = {"view": view, "zoom": zoom, "up": up, "roll": roll}
     seen_by = None if camera is None else _camera_in(camera)
     if grid_volume:
-        _write(output, show.grid_volume(light, field, cut=cut, camera=seen_by, **options, **look), seen_by)
+        _write(output, show.grid_volume(light, field, cut=cut, camera=seen_by, **options, **seen_from), seen_by)
     else:
         asked = several or ([] if isovalue is None else [isovalue])
         _note_outside(light, field, asked)
-        seen_by = seen_by or _fitted(light, field, asked, sweep is not None, options, look)
+        seen_by = seen_by or _fitted(light, field, asked, sweep is not None, options, seen_from)
         options |= {"trust": trust, "bar": scale_bar, "camera": seen_by}
         if gathered is not None:
             options |= {"exact": gathered}
@@ -161,7 +167,7 @@ def preview(
             _film(light, field, sweep, _drawn(light, field, local, split, options), seen_by)
         else:
             if trust and camera is None:  # the scale below leaves the picture another aspect
-                options |= look | {"camera": None}
+                options |= seen_from | {"camera": None}
             with progress_bars() as progress:
                 options |= {"progress": progress}
                 if several:

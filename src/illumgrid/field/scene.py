@@ -35,11 +35,18 @@ class Material:
     transmission : float
         Fraction of the light that goes straight through, 0 to 1: the solid of a field is then a thin shell, with light
         inside. What is neither reflected nor transmitted is absorbed.
+    roughness : float, optional
+        Of a clear coat, from 0, a mirror, to 1. Pictures only: light paths know nothing of coats. None: no coat.
+    translucent : float
+        Share of what lies behind that pictures show through the surface. Pictures only: light does not enter the solid;
+        what `transmission` lets through is seen anyway.
     """
 
     albedo: Floats = field(default_factory=lambda: np.full(3, 0.8))
     emission: Floats = field(default_factory=lambda: np.zeros(3))
     transmission: float = 0.0
+    roughness: float | None = None
+    translucent: float = 0.0
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "albedo", _rgb(self.albedo, "albedo", 1.0))
@@ -53,6 +60,15 @@ class Material:
             )
         if self.transmission > 0 and self.emission.any():
             raise BadInput("a material with transmission has an emission; expected one of the two: leave one out")
+        if self.roughness is not None and not 0.0 <= self.roughness <= 1.0:
+            raise BadInput(f"roughness is {self.roughness}; expected a number from 0 (a mirror) to 1")
+        if not 0.0 <= self.translucent <= 1.0:
+            raise BadInput(f"translucent is {self.translucent}; expected a number from 0 to 1")
+
+    @property
+    def plain(self) -> bool:
+        """Whether pictures need no rays for it: no coat, and nothing is seen through it."""
+        return self.roughness is None and not (self.transmission or self.translucent)
 
 
 _HELD = 1e-5
@@ -198,8 +214,10 @@ class Quad:
                 raise BadInput(f"{name} of quad {self.name!r} is {vector.tolist()}; expected three finite numbers")
             vector.setflags(write=False)
             object.__setattr__(self, name, vector)
-        if self.material.transmission > 0:
-            raise BadInput(f"quad {self.name!r} has a transmission; expected one for a field only")
+        if not self.material.plain:
+            raise BadInput(
+                f"quad {self.name!r} has a transmission, a coat or is translucent; expected that of a field only"
+            )
         lengths = np.linalg.norm(self.edge_u) * np.linalg.norm(self.edge_v)
         if not np.linalg.norm(np.cross(self.edge_u, self.edge_v)) > 1e-6 * lengths:
             raise BadInput(f"the edges of quad {self.name!r} are parallel or zero; expected two that span an area")

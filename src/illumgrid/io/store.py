@@ -40,6 +40,7 @@ FORMAT = 3  # 1 had RGB only; to 2, fields were float32 with x fastest, and one 
 EXR, RUN, PREVIEW, MOMENTS = "illumination.exr", "run.json", "preview.png", "moments.npz"
 PLACE = ("origin", "spacing", "direction")
 BINS = 64  # of the histogram of a field
+LOOKS = ("transmission", "translucent")
 EDGES = ("corner", "edge_u", "edge_v")
 KINDS = {
     "Sky": ("name", "radiance"),
@@ -239,7 +240,8 @@ def _describe(stored: Stored) -> Record:
         {"name": f.name, "range": f.range.tolist(), "inside": f.inside, "falling": f.falling}
         | {"slope": f.volume.slope, "intercept": f.volume.intercept, "unit": f.volume.unit}
         | {"albedo": f.material.albedo.tolist(), "emission": f.material.emission.tolist()}
-        | ({"transmission": f.material.transmission} if f.material.transmission else {})
+        | {n: getattr(f.material, n) for n in LOOKS if getattr(f.material, n)}
+        | ({} if f.material.roughness is None else {"roughness": f.material.roughness})
         | {"type": f.volume.stored.dtype.name, "extremes": f.volume.extremes}
         | {"histogram": histogram(f.volume, BINS)[0].tolist()}
         | lattice(f.volume)
@@ -332,9 +334,11 @@ def _rebuild(record: Record, plan: Plan, parts: exr.Parts, volumes: list[Volume]
             parts.pop(part),
         )
         rows = tuple(_grid(spec, channels, parts.pop(part)) for part in _rows(record, about["name"]))
-        grids.append(replace(_grid(spec, channels, light), rows=rows) if rows else _grid(spec, channels, light))
+        grid = _grid(spec, channels, light)
+        grids.append(replace(grid, values=grid.light, rows=rows) if rows else grid)
         volume = _field_volume(record, about, plan, parts) if volumes is None else volumes[number]
-        material = Material(about["albedo"], about["emission"], about.get("transmission", 0.0))
+        looks = {name: about[name] for name in (*LOOKS, "roughness") if name in about}
+        material = Material(about["albedo"], about["emission"], **looks)
         falling = about.get("falling", False)
         held = about.get("isovalue")
         fields.append(Field(about["name"], volume, material, about["range"], about["inside"], falling, held))

@@ -23,7 +23,8 @@ from illumgrid.rng import shifted_seed
 from illumgrid.show.camera import Camera
 from illumgrid.show.engines import software
 from illumgrid.show.engines.software import SIDE, Hits
-from illumgrid.show.shade import Colors, Shown
+from illumgrid.show.looks import LAYERS, Layer, arriving, coated, layers_of
+from illumgrid.show.shade import Coat, Colors, Shown
 from illumgrid.transport.samples import Queries
 
 MOST_PATHS = 1 << 20
@@ -181,29 +182,49 @@ class Gathering:
         """
         ray, lookup, usual = self.trust[np.maximum(hits.number, 0)].T
         shape = np.divide(known, usual, out=np.ones(len(known)), where=usual > 0)
-        variance = lookup * np.maximum(shape, _LEAST_SHAPE)
+        variance = lookup * np.clip(shape, _LEAST_SHAPE, 1e12)  # a hole may lie where lookups are not off at all
         worth = np.divide(ray, variance, out=np.full(len(known), np.inf), where=variance > 0)
         return np.asarray(np.clip(worth, FEWEST_TRUST, MOST_TRUST))
 
-    def blended(self, hits: Hits, pixel: NDArray[np.int64], total: Colors, count: NDArray[np.int32]) -> Colors:
+    def blended(
+        self, hits: Hits, pixel: NDArray[np.int64], total: Colors, count: NDArray[np.int32],
+        inner: NDArray[np.bool_] | None = None,
+    ) -> Colors:  # fmt: skip
         """Irradiance (n, 3) at sub-samples that belong to these pixels (n,), from sums (n, 3) over so many rays (n,).
 
-        Rays of the sub-samples of a pixel on one surface count together; each keeps what its lookup differs by.
+        Rays of the sub-samples of a pixel on one surface count together; each keeps what its lookup differs by. Of the
+        `inner` sides (n,) of films lookups, which hold light of the outer ones, are worth little.
         """
         light, known = looked_up(self.shown, hits)
-        group = pixel * self.surfaces + np.maximum(hits.number, 0)
+        worth = np.zeros(len(pixel)) if self.exact.full else self.worth_of_lookup(hits, known)
+        group = self._groups(hits, pixel, inner)
+        if inner is not None:
+            worth[inner] = 0.0 if self.exact.full else FEWEST_TRUST
 
         def summed(values: NDArray[np.floating]) -> Floats:
             return np.bincount(group, values).astype(float)
 
         rays, members = summed(count.astype(float))[group], np.bincount(group)[group]
-        worth = np.zeros(len(group)) if self.exact.full else self.worth_of_lookup(hits, known)
         share = np.divide(rays, rays + summed(worth)[group] / members, out=np.zeros(len(group)), where=rays > 0)
         for color in range(3):
             gathered = summed(total[:, color])[group] / np.maximum(rays, 1.0)
             before = light[:, color] if self.exact.full else summed(light[:, color])[group] / members
             light[:, color] = np.maximum(light[:, color] + share * (gathered - before), 0.0)
         return light
+
+    def _groups(
+        self, hits: Hits, pixel: NDArray[np.int64], inner: NDArray[np.bool_] | None = None
+    ) -> NDArray[np.int64]:
+        """Numbers (n,) that sub-samples of a pixel share which show the same side of the same surface."""
+        group = pixel * self.surfaces + np.maximum(hits.number, 0)
+        return np.asarray(group if inner is None else 2 * group + inner)
+
+    def coats(self, layer: Layer, pixel: NDArray[np.int64], total: Colors, count: NDArray[np.int32]) -> Coat:
+        """What coats show at sub-samples, from sums of radiance (n, 3) over so many rays (n,)."""
+        rows, group = coated(self.shown, layer), self._groups(layer.hits, pixel)
+        rays = np.maximum(np.bincount(group, count), 1)[group[rows]]
+        found = [np.bincount(group, total[:, color])[group[rows]] / rays for color in range(3)]
+        return Coat.over(layer.hits.facing, rows, np.stack(found, axis=1).astype(np.float32))
 
     def pictures(
         self, background: Colors, refined: bool = False, progress: Progress = lambda what, done, total: None
@@ -212,8 +233,10 @@ class Gathering:
         from illumgrid.backends.numba_ import cores
 
         steps = list(pairwise([0, *steps_to(self.exact.paths)]))
-        total = np.zeros((self.height * self.width * SIDE**2, 3), np.float32)
-        count = np.zeros(len(total), np.int32)
+        depth = LAYERS if any(f.material.transmission for f in self.shown.displayed.fields) else 1
+        kinds = 1 if self.shown.plain else 2  # light, and what coats reflect
+        total = np.zeros((kinds, depth, self.height * self.width * SIDE**2, 3), np.float32)
+        count = np.zeros(total.shape[:-1], np.int32)
         per_row = self.width * SIDE**2
         rows = max(1, _BAND // per_row)
         with ThreadPoolExecutor(cores()) as pool:
@@ -222,41 +245,86 @@ class Gathering:
                 for first in range(0, self.height, rows):
                     band = range(first, min(first + rows, self.height))
                     part = slice(band.start * per_row, band.stop * per_row)
-                    hits = self._hits(pool, band)
-                    pixel = self.gather(hits, band.start, some, total[part], count[part])
-                    light = self.blended(hits, pixel, total[part], count[part])
-                    color = software.colors_of(self.shown, hits, background, light)
+                    layers, lights, coats = self._layers(pool, band), [], []
+                    for k, layer in enumerate(layers):
+                        sums = total[:, k, part], count[:, k, part]
+                        inner = None if depth == 1 else layer.inner
+                        pixel = self.gather(layer.hits, band.start, some, sums[0][0], sums[1][0], inner)
+                        if kinds > 1:
+                            self._look(pool, layer, pixel, band.start, some, *sums)
+                            coats.append(self.coats(layer, pixel, sums[0][1], sums[1][1]))
+                        lights.append(self.blended(layer.hits, pixel, sums[0][0], sums[1][0], inner))
+                    color = software.composed(self.shown, layers, background, lights, coats or None)
                     strips.append(software.averaged(color, self.width))
                     progress(f"{some[-1][1]} rays a pixel", band.stop, self.height)
                 yield np.concatenate(strips)
 
     def gather(
-        self, hits: Hits, first: int, steps: list[tuple[int, int]], total: Colors, count: NDArray[np.int32]
-    ) -> NDArray[np.int64]:
+        self, hits: Hits, first: int, steps: list[tuple[int, int]], total: Colors, count: NDArray[np.int32],
+        inner: NDArray[np.bool_] | None = None,
+    ) -> NDArray[np.int64]:  # fmt: skip
         """Add light and number of these paths to those of sub-samples (n,) from picture row `first` on.
 
         The four sub-samples of a pixel share the paths of one sequence, a quarter of each step for each; returns the
-        pixels that they belong to, counted from that row.
+        pixels that they belong to, counted from that row. The `inner` sides (n,) of films are left out.
         """
         solve, _ = tracer_of(self.shown.light, self.exact.full)
-        y, x = np.divmod(np.arange(len(hits.what)), self.width * SIDE)
-        pixel, place = y // SIDE * self.width + x // SIDE, y % SIDE * SIDE + x % SIDE
+        pixel, place = self._pixels(len(hits.what))
         lit = np.concatenate([hits.lit(k) for k in range(self.surfaces)])
+        lit = lit if inner is None else lit[~inner[lit]]
         for number in range(SIDE**2):
             mine = lit[place[lit] == number]
             asked = self.asked(hits, mine, (pixel[mine] + first * self.width).astype(np.uint64))
-            for low, high in steps:
-                start, stop = (low + (high - low) * k // SIDE**2 for k in (number, number + 1))
-                if start < stop:
-                    found, walked = solve(asked, range(start, stop), self.seed)
-                    total[mine] += found * walked[:, None]
-                    count[mine] += walked
-        return np.asarray(pixel)
+            for rays in _quarters(steps, number):
+                found, walked = solve(asked, rays, self.seed)
+                total[mine] += found * walked[:, None]
+                count[mine] += walked
+        return pixel
 
-    def _hits(self, pool: Executor, band: range) -> Hits:
+    def _look(
+        self, pool: Executor, layer: Layer, pixel: NDArray[np.int64], first: int, steps: list[tuple[int, int]],
+        total: Colors, count: NDArray[np.int32],
+    ) -> None:  # fmt: skip
+        """As `gather`, by sight: light of the inner sides of films to total[0], what coats reflect to total[1]."""
+        _, place = self._pixels(len(pixel))
+        for kind, (lit, factor) in enumerate(((np.flatnonzero(layer.inner), np.pi), (coated(self.shown, layer), 1.0))):
+            seed = shifted_seed(self.seed, 3 + kind)
+
+            def look(rows: NDArray[np.int64], rays: range, kind: int = kind, seed: int = seed) -> Colors:
+                ids = (pixel[rows] + first * self.width).astype(np.uint64)
+                return arriving(self.shown, self.camera.eye, layer, rows, ids, rays, seed, kind == 0)
+
+            for number in range(SIDE**2):
+                mine = lit[place[lit] == number]
+                for rays in _quarters(steps, number) if len(mine) else ():
+                    parts = pool.map(partial(look, rays=rays), np.array_split(mine, 16))
+                    total[kind, mine] += np.float32(factor) * np.concatenate(list(parts))
+                    count[kind, mine] += len(rays)
+
+    def _pixels(self, many: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Pixels (n,) that sub-samples belong to, counted from their first row, and places (n,) in them."""
+        y, x = np.divmod(np.arange(many), self.width * SIDE)
+        return y // SIDE * self.width + x // SIDE, y % SIDE * SIDE + x % SIDE
+
+    def _layers(self, pool: Executor, band: range) -> list[Layer]:
+        if not self.shown.plain:
+            self.shown.sight  # noqa: B018  before threads ask for it
         directions = software.directions_of(self.camera, self.width, band, self.height)
-        parts = pool.map(partial(software.first_hits, self.shown, self.camera.eye), np.array_split(directions, 8))
-        return Hits(*(np.concatenate(arrays) for arrays in zip(*(vars(part).values() for part in parts))))
+        parts = list(pool.map(partial(layers_of, self.shown, self.camera.eye), np.array_split(directions, 8)))
+        found = []
+        for same in zip(*parts):
+            hits = Hits(*(np.concatenate(arrays) for arrays in zip(*(vars(one.hits).values() for one in same))))
+            within, weight, behind = (np.concatenate(arrays) for arrays in zip(*(one[1:] for one in same)))
+            found.append(Layer(hits, within, weight, behind))
+        return found
+
+
+def _quarters(steps: list[tuple[int, int]], number: int) -> Iterator[range]:
+    """The paths of these steps that sub-sample `number` of a pixel walks."""
+    for low, high in steps:
+        start, stop = (low + (high - low) * k // SIDE**2 for k in (number, number + 1))
+        if start < stop:
+            yield range(start, stop)
 
 
 def steps_to(paths: int) -> list[int]:

@@ -163,7 +163,7 @@ def _shown(
 
 
 def _drawn(shown: Shown, camera: Camera, sheet: _Sheet, rows: int) -> Picture:
-    if sheet.engine == "software":
+    if sheet.engine == "software" or not shown.plain:
         return software.draw(shown, camera, sheet.width, rows, sheet.background)
     parts = triangles.seen(shown, camera.eye)
     return gl.draw(parts, camera, sheet.width, rows, sheet.background, sheet.engine)

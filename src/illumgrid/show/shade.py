@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,6 +10,7 @@ from numpy.typing import NDArray
 from illumgrid.field.scene import Scene
 from illumgrid.field.volume import Floats
 from illumgrid.light import Illumination
+from illumgrid.show.looks import Sight, dimmed, displayed, sight_of
 from illumgrid.show.trust import trust_colors
 from illumgrid.tone import WHITE, curve
 
@@ -23,6 +25,28 @@ Colors = NDArray[np.float32]
 def opaque(color: Colors) -> Colors:
     """Colours (..., 4) of full coverage."""
     return np.concatenate([color, np.ones((*color.shape[:-1], 1), np.float32)], axis=-1)
+
+
+class Coat(NamedTuple):
+    """What coats add.
+
+    Parameters
+    ----------
+    radiance : (n, 3) float32
+        That they reflect to the eye.
+    matte : (n,) float64
+        Share of the matte light that leaves through them.
+    """
+
+    radiance: Colors
+    matte: Floats
+
+    @classmethod
+    def over(cls, facing: Floats, rows: NDArray[np.int64], radiance: Colors) -> "Coat":
+        """Coats over some rows (m,) of n that face the eye by these cosines (n,), and reflect this radiance (m, 3)."""
+        whole = cls(np.zeros((len(facing), 3), np.float32), np.ones(len(facing)))
+        whole.radiance[rows], whole.matte[rows] = radiance, dimmed(facing[rows])
+        return whole
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,26 +81,47 @@ class Shown:
         return self.light.scene
 
     @cached_property
+    def displayed(self) -> Scene:
+        """Scene with the materials that are shown."""
+        return displayed(self.scene)
+
+    @cached_property
+    def sight(self) -> Sight:
+        """The scene laid out for films and coats."""
+        return sight_of(self)
+
+    @property
+    def plain(self) -> bool:
+        """Whether nothing is a film or has a coat."""
+        return all(field.material.plain for field in self.scene.fields)
+
+    @cached_property
     def exposure(self) -> float:
         """Factor on albedo/π · E."""
         return self.light.exposure * float(2.0**self.stops)
 
-    def field(self, number: int, points: Floats, facing: Floats, light: Colors | None = None) -> Colors:
+    def field(
+        self, number: int, points: Floats, facing: Floats, light: Colors | None = None, coat: Coat | None = None
+    ) -> Colors:
         """Colours (n, 3) of the level set of a field at world points (n, 3) that face the eye by this cosine (n,).
 
         Irradiance `light` (n, 3), if any, takes the place of a lookup.
         """
         if self.trust:
             return trust_colors(self.light.grids[number], points, facing)
-        albedo = self.scene.fields[number].material.albedo
+        material = self.displayed.fields[number].material
+        albedo = material.albedo
         if self.local:
-            return self._lamplit(albedo / albedo.max(initial=1e-9), facing)
+            return self._lamplit((1 - material.transmission) * albedo / albedo.max(initial=1e-9), facing)
         light = self.light.grids[number].lookup(points, self.share) if light is None else light
-        return curve(light * (albedo / np.pi * self.exposure).astype(np.float32))
+        shown = light * (albedo / np.pi * self.exposure).astype(np.float32)
+        if coat is not None:
+            shown = shown * coat.matte[:, None].astype(np.float32) + coat.radiance * np.float32(self.exposure)
+        return curve(shown)
 
     def cap(self, number: int) -> Colors:
         """Colour (3,) of the cuts through the solid of a field."""
-        albedo = np.full(3, 0.5) if self.trust else self.scene.fields[number].material.albedo
+        albedo = np.full(3, 0.5) if self.trust else self.displayed.fields[number].material.albedo
         return (CAP_TONE * albedo).astype(np.float32)
 
     def wall(self, number: int, u: Floats, v: Floats, facing: Floats, light: Colors | None = None) -> Colors:

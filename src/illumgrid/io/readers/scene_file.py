@@ -37,9 +37,10 @@ def read_scene(path: str | os.PathLike[str], *, smoothing: float = 0.0) -> Scene
     path : str or path-like
         UTF-8, at most 1 MB, with these tables: ``[[field]]``, one or more, with `name`, `volume` (what `read_volume`
         reads, relative to this file), or `points` with `spacing`, `sigma` and perhaps `weights`, `columns`, `cell` (see
-        `density`), and perhaps `albedo`, `emission`, `transmission`, `range`, or `isovalue` (held while others sweep),
-        `inside`, `falling`, `signed` (true: two fields, ``NAME-positive`` where h >= c and ``NAME-negative`` where
-        h <= -c), and the options of `read_volume` (`spacing`, `channel`, `time`, `array`, `label`, `crop`,
+        `density`), and perhaps `albedo`, `emission`, `transmission`, `roughness`, `translucent` (see `Material`),
+        `range`, or `isovalue` (held while others sweep), `inside`, `falling`, `signed` (true: two fields,
+        ``NAME-positive`` where h >= c and ``NAME-negative`` where h <= -c), and the options of `read_volume`
+        (`spacing`, `channel`, `time`, `array`, `label`, `crop`,
         `downsample`, `follow`); ``[[quad]]`` with `name`, `corner`, `edge_u`, `edge_v` and perhaps `albedo`,
         `emission`, `texels`, `light`; ``[[light]]`` with `name` and either `radiance`, or `nadir` and `zenith`, or
         `image`, or `direction`, `angle` and `irradiance`, see `Sky` and `Distant`; ``[background]`` with `radiance`.
@@ -218,11 +219,12 @@ def _level(key: str, value: Any) -> float:
 
 
 _MATERIAL = {"albedo": _COLOUR, "emission": _COLOUR}
+_LOOKS = dict.fromkeys(("transmission", "roughness", "translucent"), _share)
 _FIELD: Mapping[str, Take] = {
     "name": _text,
     "volume": _text,
     **_MATERIAL,
-    "transmission": _share,
+    **_LOOKS,
     "range": _numbers(2, "two numbers in brackets (lowest and highest isovalue)", most=1.7e308),
     "isovalue": _level,
     "inside": _side,
@@ -376,7 +378,7 @@ def _without(table: Table, keys: Mapping[str, Any]) -> Table:
 
 def _with_material(table: Table) -> Table:
     """The table with `material` in place of `albedo` and `emission`; None for a signed field that says neither."""
-    keys = {**_MATERIAL, "transmission": 0}
+    keys = {**_MATERIAL, **_LOOKS}
     given = {key: table[key] for key in keys if key in table}
     return {**_without(table, keys), "material": None if table.get("signed") and not given else Material(**given)}
 

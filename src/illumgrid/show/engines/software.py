@@ -11,10 +11,12 @@ from illumgrid.constants import CAP, SURFACE
 from illumgrid.field.levelset import turned_levels
 from illumgrid.field.volume import Floats
 from illumgrid.show.camera import Camera
-from illumgrid.show.shade import Colors, Shown, opaque
+from illumgrid.show.looks import Layer, arriving, coated, layers_of
+from illumgrid.show.shade import Coat, Colors, Shown, opaque
 from illumgrid.tone import encode_rgba
 
 SIDE = 2  # sub-samples along each side of a pixel
+COAT_RAYS = 4  # from each sub-sample that shows a coat, in pictures by lookups
 _ROWS = 24  # picture rows that are traced together: bounds the memory
 
 
@@ -92,14 +94,17 @@ def place_on(shown: Shown, quad: int, points: Floats) -> tuple[Floats, Floats]:
     return u, v
 
 
-def colors_of(shown: Shown, hits: Hits, background: Colors, light: Colors | None = None) -> Colors:
-    """Colours (n, 4) of what is met, lit by lookups, or by irradiance `light` (n, 3)."""
+def colors_of(
+    shown: Shown, hits: Hits, background: Colors, light: Colors | None = None, coat: Coat | None = None
+) -> Colors:
+    """Colours (n, 4) of what is met, lit by lookups, or by irradiance `light` (n, 3), perhaps under coats."""
     color = np.tile(background, (len(hits.what), 1))
     for k in range(len(shown.scene.fields)):
         color[(hits.number == k) & (hits.what == CAP)] = opaque(shown.cap(k))
         lit = np.flatnonzero((hits.number == k) & (hits.what == SURFACE))
         own = None if light is None else light[lit]
-        color[lit] = opaque(shown.field(k, hits.point[lit], hits.facing[lit], own))
+        over = None if coat is None else Coat(coat.radiance[lit], coat.matte[lit])
+        color[lit] = opaque(shown.field(k, hits.point[lit], hits.facing[lit], own, over))
     for k in range(len(shown.scene.quads)):
         lit = np.flatnonzero(hits.number == len(shown.scene.fields) + k)
         u, v = place_on(shown, k, hits.point[lit])
@@ -109,10 +114,38 @@ def colors_of(shown: Shown, hits: Hits, background: Colors, light: Colors | None
     return color
 
 
+def composed(
+    shown: Shown, layers: list[Layer], background: Colors, lights: list[Colors] | None = None,
+    coats: list[Coat] | None = None,
+) -> Colors:  # fmt: skip
+    """Colours (n, 4) of layers that are seen through one another; `lights` and `coats` as in `colors_of`."""
+    total = layers[-1].behind[:, None].astype(np.float32) * background
+    for k, layer in enumerate(layers):
+        color = colors_of(
+            shown, layer.hits, background, None if lights is None else lights[k], None if coats is None else coats[k]
+        )
+        film = layer.behind > 0
+        color[film, 3] = 1 - layer.behind[film] / layer.weight[film]
+        total += layer.weight[:, None].astype(np.float32) * color
+    return np.asarray(total, np.float32)
+
+
 def draw(shown: Shown, camera: Camera, width: int, height: int, background: Colors) -> NDArray[np.uint8]:
     """Picture (height, width, 4), sRGB and coverage, of one setting of the sweep."""
 
-    def seen(directions: Floats) -> Colors:
-        return colors_of(shown, first_hits(shown, camera.eye, directions), background)
+    def coat(layer: Layer, directions: Floats) -> Coat:
+        rows = coated(shown, layer)
+        numbers = np.ascontiguousarray(directions).view(np.uint64)  # an identity that no strip changes
+        ids = numbers[rows, 0] ^ numbers[rows, 1] << np.uint64(7) ^ numbers[rows, 2] << np.uint64(13)
+        found = arriving(shown, camera.eye, layer, rows, ids, range(COAT_RAYS), 0, False)
+        return Coat.over(layer.hits.facing, rows, found / np.float32(COAT_RAYS))
 
+    def seen(directions: Floats) -> Colors:
+        layers = layers_of(shown, camera.eye, directions)
+        if shown.plain or shown.local or shown.trust:
+            return composed(shown, layers, background)
+        return composed(shown, layers, background, None, [coat(layer, directions) for layer in layers])
+
+    if not (shown.plain or shown.trust):
+        shown.sight  # noqa: B018  before threads ask for it
     return traced(seen, camera, width, height)
