@@ -12,6 +12,7 @@ and what residual paths would bring, which go on where the others end and pay th
 import argparse
 import json
 import time
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -110,8 +111,9 @@ def measure(name, scene, grid, paths):
 
 def reached(steps, error):
     """Seconds at which an error is reached, along straight lines in logarithms; None if it is not."""
-    for before, after in zip(steps, steps[1:]):
-        (e, f), (s, t) = (np.log([x["error"][0] for x in (before, after)]), np.log([x["seconds"] for x in (before, after)]))
+    for before, after in pairwise(steps):
+        e, f = np.log([x["error"][0] for x in (before, after)])
+        s, t = np.log([x["seconds"] for x in (before, after)])
         if f <= np.log(error) < e:
             return float(np.exp(s + (t - s) * (e - np.log(error)) / (e - f)))
     return steps[0]["seconds"] if steps[0]["error"][0] <= error else None
@@ -146,8 +148,10 @@ def flip(made, steps):
         name: render(made.shown.light, exact=exact, **options).astype(np.float32) / np.float32(255)
         for name, exact in kinds.items()
     }
-    off = {n: float(flip_evaluator.evaluate(drawn["truth"], drawn[n], "LDR", applyMagma=False)[1]) for n in list(kinds)[1:]}
-    return {"rays": rays, **off}
+    truth = drawn.pop("truth")
+    return {"rays": rays} | {
+        name: float(flip_evaluator.evaluate(truth, one, "LDR", applyMagma=False)[1]) for name, one in drawn.items()
+    }
 
 
 def main():
