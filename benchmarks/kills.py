@@ -14,6 +14,7 @@ puts the old one back; the summary counts this case. The exit code is 1 if anyth
 """
 
 import argparse
+import contextlib
 import json
 import os
 import random
@@ -119,7 +120,10 @@ def hidden(folder):
 
 def writing(folder, process):
     """Wait until the process has begun to write, or has ended."""
-    while process.poll() is None and not any(any(p.iterdir()) for p in hidden(folder) if p.is_dir()):
+    while process.poll() is None:
+        with contextlib.suppress(FileNotFoundError):  # renamed meanwhile
+            if any(any(p.iterdir()) for p in hidden(folder) if p.is_dir()):
+                return
         time.sleep(STEP)
 
 
@@ -196,6 +200,9 @@ def stop(folder, command, known, finished, late, signals, chance):
         found = "absent between two renames, both results complete beside it"
         (hide,) = left
         assert one_light(hide / "old", known.old) and one_light(hide / "new", known.new)
+    elif signals != signal.SIGKILL and ended == -signals:
+        found += ", the interpreter had not begun to run illumgrid"
+        assert at == ("old" if finished else None), f"exit {ended}"
     elif signals != signal.SIGKILL:
         assert ended == 130, f"exit {ended}"
     if signals != signal.SIGKILL:

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from numba import typeof
 
+from illumgrid.field import cubes
 from illumgrid.field.bricks import lay_bricks
-from illumgrid.field.levelset import isosurface, marchable, off_the_data, turned_levels
+from illumgrid.field.levelset import extract, isosurface, marchable, off_the_data, turned_levels
 from illumgrid.field.scene import Field, Material, Scene
 from illumgrid.field.signed import signed_pair
 from illumgrid.field.volume import Volume, world_to_index
@@ -55,6 +56,24 @@ def test_the_side_that_is_solid_turns_the_faces_and_nothing_else(inside):
     one, other = isosurface(volume, 0.5, "above"), isosurface(volume, 0.5, "below")
     assert np.allclose(one.bounds, other.bounds) and one.area == pytest.approx(other.area)
     assert one.volume == pytest.approx(-other.volume) and one.volume > 0
+
+
+@pytest.mark.parametrize("capped", [False, True])
+@pytest.mark.parametrize("inside", ["above", "below"])
+@pytest.mark.parametrize("rows", [1, 2, 5])
+def test_slabs_give_the_faces_of_one_call(monkeypatch, inside, capped, rows):
+    """Noise has all cases of cells; levels at data values put vertices of several edges into one corner."""
+    values = np.random.default_rng(0).integers(0, 5, (14, 9, 11))
+    values[6:9] = 0  # a slab without a surface
+    volume = Volume(values)
+    for level in (2.0, 2.3):
+        whole, faces = extract(volume, level, inside, capped)
+        with monkeypatch.context() as patch:
+            patch.setattr(cubes, "AT_ONCE", rows * (8 + 2 * capped) * (10 + 2 * capped))
+            points, again = extract(volume, level, inside, capped)
+        assert len(faces) > 1000 and np.array_equal(again, faces)
+        assert np.array_equal(points[:, 1:], whole[:, 1:])
+        np.testing.assert_allclose(points[:, 0], whole[:, 0], rtol=0, atol=2.0**-21)  # half a unit of 8 to 16
 
 
 @pytest.mark.parametrize("power", [-124, -40, 40, 100])

@@ -15,6 +15,8 @@ from illumgrid.backends.mesh import bvh
 from illumgrid.backends.numba_ import Numba
 from illumgrid.bake.accumulator import Bake
 from illumgrid.bake.targets import wall_queries
+from illumgrid.field import cubes
+from illumgrid.field.levelset import isosurface
 from illumgrid.field.scene import Scene, level_table
 from illumgrid.io import disk
 from illumgrid.transport.tracer import prepare
@@ -86,6 +88,21 @@ def test_ctrl_c_ends_the_building_of_a_tree(monkeypatch):
     assert ended == [[1, 1, 1]]
 
 
+def test_ctrl_c_ends_marching_cubes_after_a_slab(monkeypatch):
+    real, slabs = cubes._cubes, []
+
+    def marching(values, *more):
+        slabs.append(values.shape)
+        os.kill(os.getpid(), signal.SIGINT)
+        return real(values, *more)
+
+    monkeypatch.setattr(cubes, "_cubes", marching)
+    monkeypatch.setattr(cubes, "AT_ONCE", 200)
+    with pytest.raises(KeyboardInterrupt):
+        isosurface(ball(12), 0.5)
+    assert slabs == [(2, 12, 12)]
+
+
 def test_tracers_of_a_process_share_their_threads(box):
     scene, _ = box
     one, other, fewer = (prepare(Numba(threads=n), scene).threads for n in (2, 2, 1))
@@ -120,8 +137,9 @@ def test_other_signals_are_like_ctrl_c(tmp_path, stop):
     assert "Traceback" not in said and [p.name for p in tmp_path.iterdir()] == ["v.npy"]
 
 
-def test_ctrl_c_during_the_imports_has_no_traceback(tmp_path):
-    (tmp_path / "typer.py").write_text("raise KeyboardInterrupt")
+@pytest.mark.parametrize("stop", disk.STOPS)
+def test_a_stop_during_the_imports_has_no_traceback(tmp_path, stop):
+    (tmp_path / "typer.py").write_text(f"import os, time; os.kill(os.getpid(), {int(stop)}); time.sleep(9)")
     path = os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])
     done = subprocess.run(
         [*COMMAND, "--version"], capture_output=True, text=True, env={**os.environ, "PYTHONPATH": path}

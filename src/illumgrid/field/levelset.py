@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from illumgrid.errors import BadInput
+from illumgrid.field import cubes
 from illumgrid.field.bricks import Bricks, lay_bricks
 from illumgrid.field.layers import ALL, Channel, light_tables
 from illumgrid.field.scene import Scene
@@ -67,8 +68,6 @@ def extract(volume: Volume, isovalue: float, inside: Side, capped: bool) -> tupl
 
     Faces are counterclockwise as seen from outside, with right-handed index axes.
     """
-    from skimage.measure import marching_cubes
-
     level = off_the_data(volume, float(volume.to_stored(isovalue)), inside)
     low, high = float(volume.stored.min()), float(volume.stored.max())
     beyond = None
@@ -81,12 +80,9 @@ def extract(volume: Volume, isovalue: float, inside: Side, capped: bool) -> tupl
     # scikit-image adds 2e-16 to every difference, which would dominate tiny fields: scale by a power of two.
     exponent = int(np.frexp(high - low)[1])
     # Its faces wind by the left hand: "ascent" orients them, by the right hand, away from higher values.
-    index, faces, _, _ = marching_cubes(
-        _scaled(volume.stored, -exponent, beyond), float(np.ldexp(level, -exponent)),
-        gradient_direction="ascent" if inside == "above" else "descent",
-    )  # fmt: skip
-    index = index.astype(float) - (1.0 if capped else 0.0)
-    return np.clip(index, 0.0, np.array(volume.shape) - 1.0), faces.astype(np.int64)
+    scaled, winding = _scaled(volume.stored, -exponent, beyond), "ascent" if inside == "above" else "descent"
+    index, faces = cubes.march(scaled, float(np.ldexp(level, -exponent)), winding)
+    return np.clip(index - (1.0 if capped else 0.0), 0.0, np.array(volume.shape) - 1.0), faces
 
 
 def _scaled(values: NDArray[Any], exponent: int, beyond: float | None) -> NDArray[np.float32]:
