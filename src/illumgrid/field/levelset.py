@@ -80,8 +80,8 @@ def extract(volume: Volume, isovalue: float, inside: Side, capped: bool) -> tupl
     # scikit-image adds 2e-16 to every difference, which would dominate tiny fields: scale by a power of two.
     exponent = int(np.frexp(high - low)[1])
     # Its faces wind by the left hand: "ascent" orients them, by the right hand, away from higher values.
-    scaled, winding = _scaled(volume.stored, -exponent, beyond), "ascent" if inside == "above" else "descent"
-    index, faces = cubes.march(scaled, float(np.ldexp(level, -exponent)), winding)
+    winding: cubes.Winding = "ascent" if inside == "above" else "descent"
+    index, faces = cubes.march(_scaled(volume.stored, -exponent, beyond), float(np.ldexp(level, -exponent)), winding)
     return np.clip(index - (1.0 if capped else 0.0), 0.0, np.array(volume.shape) - 1.0), faces
 
 
