@@ -5,8 +5,8 @@ A ball inside a film
 Figure 8 of Banks and Beason (2007): particles attach themselves to a ball, and an isosurface of their density wraps it
 like a film. The film transmits light, so the ball inside is lit through it, and both are shiny.
 
-The density of the particles is a field whose isovalue is swept. The ball is a second field, held at one isovalue: its light
-is computed for several places of the sweep, since it changes with the film around it.
+The density of the particles is a field whose isovalue is swept. The ball is a second field, held at one isovalue: its
+light is computed for several places of the sweep, since it changes with the film around it.
 """
 
 from dataclasses import replace
@@ -30,7 +30,7 @@ radius = np.linalg.norm(density.origin + index * density.spacing, axis=1).reshap
 ball = ig.Volume(1 - radius, density.origin, density.spacing)
 
 # %%
-# The film lets 55 % of the light through and reflects a third. `roughness` is that of a clear coat, which pictures show.
+# The film lets 55 % of the light through and reflects a third. `roughness` is that of a clear coat, for pictures only.
 
 low, high = np.quantile(density.values, [0.90, 0.97])
 film = Field("film", density, Material((0.30, 0.35, 0.43), transmission=0.55, roughness=0.12), (low, high))
@@ -39,8 +39,8 @@ scene = replace(ig.Scene.studio(density), fields=(film, solid))
 light = ig.run(scene, grid=32, paths=32)
 
 # %%
-# **What to look for:** the ball shines through the film and is tinted by it; the inner side of the far wall of the film is
-# seen as well, lit by what comes through. Highlights are images of the key light, and follow the film as it shrinks.
+# **What to look for:** the ball shines through the film and is tinted by it; the inner side of the far wall of the film
+# is seen as well, lit by what comes through. Highlights are images of the key light, and follow the film as it shrinks.
 
 camera = fit_camera(scene, widest_row(scene), 4 / 3)
 figure, axes = plt.subplots(1, 3, figsize=(10.5, 3.0), facecolor="0.235", layout="constrained")
@@ -51,8 +51,8 @@ for ax, row in zip(axes, scene.levels([0.0, 0.5, 1.0])):
 plt.show()
 
 # %%
-# Looks belong to pictures, so they can be changed without a new run: a dull film, and one like a mirror. From a terminal,
-# ``illumgrid preview film-light --look film.roughness=0.5 --exact 16 --output dull.png`` does the same for a saved run.
+# Looks belong to pictures, so they can be changed without a new run: a dull film, and one like a mirror. From a
+# terminal, ``illumgrid preview DIR --look film.roughness=0.5 --exact 16 --output dull.png`` does the same.
 
 figure, axes = plt.subplots(1, 2, figsize=(7.0, 3.0), facecolor="0.235", layout="constrained")
 for ax, roughness in zip(axes, (0.5, 0.0)):
