@@ -1,5 +1,6 @@
-"""How surfaces look in pictures, as options say it: coats, translucency."""
+"""How surfaces look in pictures, as options say it: coats, what is seen through, cuts, colours of a second quantity."""
 
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -8,6 +9,7 @@ from illumgrid.errors import BadInput
 
 if TYPE_CHECKING:
     from illumgrid.light import Illumination
+    from illumgrid.show.tints import Tint
 
 KEYS = "roughness", "translucent"
 
@@ -20,6 +22,48 @@ Look = Annotated[
         "lets 60 % of what lies behind through. Repeatable.",
     ),
 ]
+Clips = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--clip",
+        metavar="AXIS=PLACE",
+        help="Leave out what lies beyond a plane of the world: x=12.5, or before it: -x=12.5. The cut shows the data "
+        "in grey; the light is that of the whole. Repeatable.",
+    ),
+]
+Color = Annotated[
+    str | None,
+    typer.Option(
+        metavar="NAME|FILE",
+        help="Colour surfaces by another field of the run, or by a volume file of the same world, at the brightness of "
+        "white ones.",
+    ),
+]
+ColorMap = Annotated[str, typer.Option("--cmap", metavar="NAME", help="Colormap of matplotlib for --color.")]
+ColorRange = Annotated[
+    tuple[float, float] | None,
+    typer.Option(metavar="LO HI", help="Values of --color at the ends of the colormap. [default: all that it has]"),
+]
+
+
+def tint_of(light: "Illumination", color: str | None, cmap: str, ends: tuple[float, float] | None) -> "Tint | None":
+    """The second quantity that options name: a field of the run, or a file."""
+    if color is None:
+        if cmap != "viridis" or ends is not None:
+            option = "--color-range" if ends is not None else "--cmap"
+            raise BadInput(f"{option} came without --color; expected both, or neither")
+        return None
+    from illumgrid.show.tints import Tint
+
+    for field in light.scene.fields:
+        if field.name == color:
+            return Tint(field.volume, color, cmap, ends)
+    if not Path(color).exists():
+        names = ", ".join(field.name for field in light.scene.fields)
+        raise BadInput(f"--color is {color[:60]!r}; expected a volume file, or a field of the run: {names}")
+    from illumgrid.io.readers import read_volume
+
+    return Tint(read_volume(color), Path(color).name.partition(".")[0], cmap, ends)
 
 
 def looking(light: "Illumination", looks: list[str] | None) -> "Illumination":

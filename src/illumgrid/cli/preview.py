@@ -11,7 +11,7 @@ import typer
 
 from illumgrid.cli.lights import SkyImage, Turn, Weights, relit
 from illumgrid.cli.long import loaded
-from illumgrid.cli.looks import Look, looking
+from illumgrid.cli.looks import Clips, Color, ColorMap, ColorRange, Look, looking, tint_of
 from illumgrid.cli.terminal import progress_bars, say
 from illumgrid.errors import BadInput, shown, shown_range
 
@@ -43,6 +43,8 @@ CONFLICTS = {
     },
     "--watch": {"--sweep": "a film is written once", "--isovalues": "a strip is written once",
                 "--split": "two pictures are written once"},
+    "--clip": {"--grid-volume": "the grid has a cut of its own, --cut"},
+    "--color": {"--grid-volume": "the grid shows its own light", "--trust": "error bars have their own colours"},
     "--camera": dict.fromkeys(("--view", "--zoom", "--up", "--roll"), "the camera of the picture says all of that"),
 }  # fmt: skip
 """Options that exclude each other, and the reason."""
@@ -124,6 +126,10 @@ def preview(
     sky: SkyImage = None,
     turn: Turn = 0.0,
     look: Look = None,
+    clip: Clips = None,
+    color: Color = None,
+    cmap: ColorMap = "viridis",
+    color_range: ColorRange = None,
     engine: Annotated[str, typer.Option(help="Rendering engine: auto, egl, osmesa, software.")] = "auto",
 ) -> None:
     """Draw an isosurface of a finished run, several side by side, or a sweep through the range."""
@@ -134,6 +140,7 @@ def preview(
         "--local": local, "--trust": trust, "--split": split, "--grid-volume": grid_volume, "--scale-bar": scale_bar,
         "--exposure": exposure != 0, "--view": view is not None, "--zoom": zoom != 1, "--up": up is not None,
         "--roll": roll != 0, "--camera": camera is not None, "--exact": exact is not None, "--watch": watch,
+        "--clip": bool(clip), "--color": color is not None,
         "--engine": engine not in ("auto", "software"),
     }  # fmt: skip
     _check(given, output, sweep, isovalue, cut, background)
@@ -143,10 +150,11 @@ def preview(
     light = looking(relit(loaded(folder), weights, sky, turn), look)
     if engine == "auto" and engine_used != "software" and show.too_large_for_meshes(light.scene):
         engine_used, why = "software", "the field is large, and rays need no mesh of it"
-    if engine_used != "software" and any(not f.material.plain for f in light.scene.fields):
+    tint = tint_of(light, color, cmap, color_range)
+    if engine_used != "software" and (clip or any(not f.material.plain for f in light.scene.fields)):
         if engine != "auto":
-            raise BadInput(f"--engine is {engine}; expected software: coats and what is seen through are drawn by rays")
-        engine_used, why = "software", "coats and what is seen through are drawn by rays"
+            raise BadInput(f"--engine is {engine}; expected software: coats, films and cuts are drawn by rays")
+        engine_used, why = "software", "coats, films and cuts are drawn by rays"
     options: dict[str, Any] = {"background": background, "engine": engine_used, "stops": exposure}
     if size != SIZE:
         options |= {"width": size[0], "height": size[1]}
@@ -158,7 +166,7 @@ def preview(
         asked = several or ([] if isovalue is None else [isovalue])
         _note_outside(light, field, asked)
         seen_by = seen_by or _fitted(light, field, asked, sweep is not None, options, seen_from)
-        options |= {"trust": trust, "bar": scale_bar, "camera": seen_by}
+        options |= {"trust": trust, "bar": scale_bar, "camera": seen_by, "clip": clip or (), "tint": tint}
         if gathered is not None:
             options |= {"exact": gathered}
             if watch:
@@ -177,6 +185,8 @@ def preview(
             _write(output, picture, seen_by)
     if trust:
         _say_doubts(light)
+    if clip:
+        say("note: cuts show the data in grey, and the light is that of the whole solid")
     wrote = f"wrote {output}" if sweep is None else f"wrote {sweep[1]}, {sweep[0]} isovalues"
     say(wrote + ("" if local or trust else f" at exposure {light.exposure * 2**exposure:.4g}"))
     if engine == "auto" and exact is None:

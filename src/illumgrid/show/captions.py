@@ -56,6 +56,28 @@ def scale_bar(picture: Picture, camera: Camera, middle: Floats, volume: Volume) 
     return np.asarray(image)
 
 
+def color_bar(picture: Picture, table: NDArray[np.uint8], ends: tuple[float, float], name: str) -> Picture:
+    """A picture with a colormap (n, 3) in its upper right corner, the values at its ends, and a name."""
+    from PIL import Image, ImageDraw
+
+    width, size = int(picture.shape[1]), _text_size(picture)
+    image, across = Image.fromarray(picture), max(2, round(0.25 * width))
+    colors = table[np.linspace(0, len(table) - 1, across).round().astype(int)]
+    bar = np.repeat(colors[None], max(4, size // 2), axis=0)
+    left, top, ink = width - size - across, size // 2, _ink(picture[: 3 * size, -width // 3 :])
+    image.paste(Image.fromarray(bar), (left, top))
+    draw, font, below = ImageDraw.Draw(image), _font(size), top + len(bar) + size // 4
+    low, high = (shown(end, ends) for end in ends)
+    draw.text((left, below), low, ink, font, anchor="lt")
+    draw.text((left + across, below), high, ink, font, anchor="rt")
+    room = across - sum(font.getlength(f"{end}  ") for end in (low, high))
+    if font.getlength(name) <= room:
+        draw.text((left + across / 2, below), name, ink, font, anchor="mt")
+    else:
+        draw.text((left + across, below + size + size // 4), name, ink, font, anchor="rt")
+    return np.asarray(image)
+
+
 def round_down(length: float) -> float:
     """The largest of 1, 2 or 5 times a power of ten up to `length`."""
     power = 10.0 ** math.floor(math.log10(length))

@@ -234,7 +234,7 @@ class Gathering:
 
         steps = list(pairwise([0, *steps_to(self.exact.paths)]))
         depth = LAYERS if any(f.material.transmission for f in self.shown.displayed.fields) else 1
-        kinds = 1 if self.shown.plain else 2  # light, and what coats reflect
+        kinds = 1 if self.shown.matte else 2  # light, and what coats reflect
         total = np.zeros((kinds, depth, self.height * self.width * SIDE**2, 3), np.float32)
         count = np.zeros(total.shape[:-1], np.int32)
         per_row = self.width * SIDE**2
@@ -307,7 +307,7 @@ class Gathering:
         return y // SIDE * self.width + x // SIDE, y % SIDE * SIDE + x % SIDE
 
     def _layers(self, pool: Executor, band: range) -> list[Layer]:
-        if not self.shown.plain:
+        if not self.shown.matte:
             self.shown.sight  # noqa: B018  before threads ask for it
         directions = software.directions_of(self.camera, self.width, band, self.height)
         parts = list(pool.map(partial(layers_of, self.shown, self.camera.eye), np.array_split(directions, 8)))

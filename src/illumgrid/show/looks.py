@@ -20,6 +20,7 @@ from illumgrid.grid import IlluminationGrid
 from illumgrid.grid.cache import Cache
 from illumgrid.grid.channels import columns_of
 from illumgrid.light import Illumination
+from illumgrid.show.cuts import clipped_layers
 
 if TYPE_CHECKING:
     from illumgrid.show.engines.software import Hits
@@ -137,6 +138,13 @@ class Layer(NamedTuple):
 
 def layers_of(shown: "Shown", eye: Floats, directions: Floats) -> list[Layer]:
     """What rays along directions (n, 3) from the eye meet, one behind the other; one layer where nothing is a film."""
+    if shown.clips:
+        return clipped_layers(shown, eye, directions)
+    return layers_from(shown, eye, directions, np.zeros(len(directions), np.int64))
+
+
+def layers_from(shown: "Shown", eye: Floats, directions: Floats, start: NDArray[np.int64]) -> list[Layer]:
+    """As `layers_of`, from one place or (n, 3), within the shells of the fields whose bits `start` (n,) has."""
     from illumgrid.backends.sight import cast_layers
     from illumgrid.show.engines.software import Hits, first_hits
 
@@ -145,10 +153,10 @@ def layers_of(shown: "Shown", eye: Floats, directions: Floats) -> list[Layer]:
         hits = first_hits(shown, eye, directions)
         return [Layer(hits, np.zeros(n, np.int64), np.ones(n), np.zeros(n))]
     sight, axes = shown.sight, shown.scene.fields[0].volume.direction
-    origin, direction = np.tile(shown.scene.to_frame(eye), (n, 1)), directions @ axes
+    origin, direction = np.broadcast_to(shown.scene.to_frame(eye), (n, 3)).copy(), directions @ axes
     t, normal = np.zeros((LAYERS, n)), np.zeros((LAYERS, n, 3))
     number, what, within = np.full((LAYERS, n), -1), np.zeros((LAYERS, n), np.int64), np.zeros((LAYERS, n), np.int64)
-    weight, start = np.zeros((LAYERS + 1, n)), np.zeros(n, np.int64)
+    weight = np.zeros((LAYERS + 1, n))
     cast_layers(sight.scene, sight.level, origin, direction, start, t, number, what, normal, within, weight)
     found = []
     for k in range(LAYERS):

@@ -2,7 +2,7 @@
 
 import io
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 
 import numpy as np
@@ -16,10 +16,12 @@ from illumgrid.light import Illumination
 from illumgrid.show import triangles
 from illumgrid.show.block import Block
 from illumgrid.show.camera import Camera, View, camera_around, fit_camera, outline_of
-from illumgrid.show.captions import isovalues_of, labelled, scale_bar
+from illumgrid.show.captions import color_bar, isovalues_of, labelled, scale_bar
+from illumgrid.show.cuts import clips_of
 from illumgrid.show.engines import choose_engine, gl, software
 from illumgrid.show.exact import Exact, Gathering
 from illumgrid.show.shade import BACKGROUND, Colors, Shown, opaque
+from illumgrid.show.tints import Tint
 from illumgrid.show.trust import scale
 from illumgrid.tone import decode_srgb, encode_srgb
 
@@ -78,6 +80,8 @@ def render(
     exact: Exact | None = None,
     watch: Callable[[Picture], None] | None = None,
     progress: Progress = lambda what, done, total: None,
+    clip: Sequence[str] = (),
+    tint: Tint | None = None,
 ) -> Picture:
     """Picture (height, width, 3), sRGB, of one setting of the sweep; (height, width, 4) on a transparent background.
 
@@ -120,6 +124,11 @@ def render(
         Called with each exact picture on the way, of four times as many rays as the one before, and with the last.
     progress : callable, optional
         Called with (what, done, total) while light is gathered.
+    clip : sequence of str
+        Planes beyond which nothing is drawn but walls: see `illumgrid.show.cuts.clips_of`. Cuts show the data in grey;
+        the light is that of the whole solid.
+    tint : Tint, optional
+        Colours of a second quantity in place of the fields' own, with a legend.
 
     Raises
     ------
@@ -129,7 +138,7 @@ def render(
     sheet = _sheet(width, height, background, engine)
     if not -STOPS <= stops <= STOPS:
         raise BadInput(f"the exposure is {stops} EV; expected a number from {-STOPS:g} to {STOPS:g}")
-    shown = _shown(light, field, isovalue, local, trust, stops)
+    shown = replace(_shown(light, field, isovalue, local, trust, stops), clips=clips_of(clip, light.scene), tint=tint)
     strips = [scale(light, width, height, sheet.ground)] if trust else []
     rows = height - sum(map(len, strips))
     if camera is None:
@@ -145,6 +154,8 @@ def render(
             outline = outline_of(light.scene, shown.row)
             middle = (outline.min(axis=0) + outline.max(axis=0)) / 2
             picture = scale_bar(picture, camera, middle, light.scene.fields[0].volume)
+        if tint is not None and not trust:
+            picture = color_bar(picture, tint.table, tint.ends, tint.name)
         if watch is not None:
             watch(picture)
     if strips and picture.shape[2] == 4:

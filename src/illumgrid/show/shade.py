@@ -10,9 +10,11 @@ from numpy.typing import NDArray
 from illumgrid.field.scene import Scene
 from illumgrid.field.volume import Floats
 from illumgrid.light import Illumination
+from illumgrid.show.cuts import Clip
 from illumgrid.show.looks import Sight, dimmed, displayed, sight_of
+from illumgrid.show.tints import Tint
 from illumgrid.show.trust import trust_colors
-from illumgrid.tone import WHITE, curve
+from illumgrid.tone import WHITE, curve, luminance
 
 BACKGROUND = 0.045  # display-linear: a dark neutral, against which white surfaces and their shadows both stand out
 CAP_TONE = (
@@ -66,6 +68,10 @@ class Shown:
         In place of light, its relative error bar: see `illumgrid.show.trust`.
     stops : float
         Exposure beyond the automatic one, in EV: each doubles the light.
+    clips : tuple of Clip
+        What is left out.
+    tint : Tint, optional
+        Colours of all fields, in place of their albedos.
     """
 
     light: Illumination
@@ -74,6 +80,8 @@ class Shown:
     local: bool = False
     trust: bool = False
     stops: float = 0.0
+    clips: tuple[Clip, ...] = ()
+    tint: Tint | None = None
 
     @cached_property
     def scene(self) -> Scene:
@@ -92,6 +100,11 @@ class Shown:
 
     @property
     def plain(self) -> bool:
+        """Whether triangles can show it: nothing is a film, has a coat or is cut."""
+        return self.matte and not self.clips
+
+    @property
+    def matte(self) -> bool:
         """Whether nothing is a film or has a coat."""
         return all(field.material.plain for field in self.scene.fields)
 
@@ -111,10 +124,16 @@ class Shown:
             return trust_colors(self.light.grids[number], points, facing)
         material = self.displayed.fields[number].material
         albedo = material.albedo
+        kept = 1.0 - material.transmission
         if self.local:
-            return self._lamplit((1 - material.transmission) * albedo / albedo.max(initial=1e-9), facing)
+            color = kept * albedo / albedo.max(initial=1e-9)
+            return self._lamplit(color if self.tint is None else kept * self.tint.colors(points), facing)
         light = self.light.grids[number].lookup(points, self.share) if light is None else light
-        shown = light * (albedo / np.pi * self.exposure).astype(np.float32)
+        if self.tint is not None:
+            bright = luminance(curve(light * np.float32(self.exposure / np.pi)))
+            shown = np.float32(kept) * bright[:, None] * self.tint.colors(points)
+        else:
+            shown = light * (albedo / np.pi * self.exposure).astype(np.float32)
         if coat is not None:
             shown = shown * coat.matte[:, None].astype(np.float32) + coat.radiance * np.float32(self.exposure)
         return curve(shown)
@@ -143,7 +162,7 @@ class Shown:
         share = np.clip((1.0 - rim) / 0.6, 0.0, 1.0)
         return np.asarray(share * share * (3 - 2 * share), np.float32)
 
-    def _lamplit(self, color: Floats, facing: Floats) -> Colors:
+    def _lamplit(self, color: NDArray[np.floating], facing: Floats) -> Colors:
         return curve(np.float32(2.0**self.stops * WHITE) * _facing(color, facing))
 
 
@@ -152,5 +171,5 @@ def fades(scene: Scene, number: int) -> bool:
     return scene.open and len(scene.quads) == 1 and not scene.quads[number].material.emission.any()
 
 
-def _facing(color: Floats, facing: Floats) -> Colors:
+def _facing(color: NDArray[np.floating], facing: Floats) -> Colors:
     return (color * np.maximum(facing, 0.0)[:, None]).astype(np.float32)

@@ -11,6 +11,7 @@ from illumgrid.constants import CAP, SURFACE
 from illumgrid.field.levelset import turned_levels
 from illumgrid.field.volume import Floats
 from illumgrid.show.camera import Camera
+from illumgrid.show.cuts import CUT, greys
 from illumgrid.show.looks import Layer, arriving, coated, layers_of
 from illumgrid.show.shade import Coat, Colors, Shown, opaque
 from illumgrid.tone import encode_rgba
@@ -70,18 +71,19 @@ class Hits:
     what: NDArray[np.int64]
 
     def lit(self, number: int) -> NDArray[np.int64]:
-        """Rows of the rays that meet a surface with light of its own: no cap."""
-        return np.flatnonzero((self.number == number) & (self.what != CAP))
+        """Rows of the rays that meet a surface with light of its own: no cap, no cut."""
+        return np.flatnonzero((self.number == number) & (self.what != CAP) & (self.what != CUT))
 
 
-def first_hits(shown: Shown, eye: Floats, directions: Floats) -> Hits:
-    """First hits along directions (n, 3) from the eye, all in the world, under one setting of the sweep."""
+def first_hits(shown: Shown, eye: Floats, directions: Floats, row: Floats | None = None) -> Hits:
+    """First hits along world directions (n, 3) from one place or (n, 3), by default under the levels that are shown."""
     from illumgrid.backends.kernels import cast_rays
 
     scene, axes, n = shown.scene, shown.scene.fields[0].volume.direction, len(directions)
     t, number, what, normal = np.zeros(n), np.zeros(n, np.int64), np.zeros(n, np.int64), np.zeros((n, 3))
-    origin, direction = np.tile(scene.to_frame(eye), (n, 1)), directions @ axes
-    cast_rays(shown.light.marchable, turned_levels(scene, shown.row), origin, direction, -1, t, number, what, normal)
+    origin, direction = np.broadcast_to(scene.to_frame(eye), (n, 3)).copy(), directions @ axes
+    level = turned_levels(scene, shown.row) if row is None else row
+    cast_rays(shown.light.marchable, level, origin, direction, -1, t, number, what, normal)
     met = number >= 0
     point = eye + np.where(met, t, 0.0)[:, None] * directions
     return Hits(point, normal @ axes.T, -np.einsum("ij,ij->i", normal, direction), number, what)
@@ -101,6 +103,9 @@ def colors_of(
     color = np.tile(background, (len(hits.what), 1))
     for k in range(len(shown.scene.fields)):
         color[(hits.number == k) & (hits.what == CAP)] = opaque(shown.cap(k))
+        cut = np.flatnonzero((hits.number == k) & (hits.what == CUT))
+        if len(cut):
+            color[cut] = opaque(greys(shown.scene.fields[k], hits.point[cut]))
         lit = np.flatnonzero((hits.number == k) & (hits.what == SURFACE))
         own = None if light is None else light[lit]
         over = None if coat is None else Coat(coat.radiance[lit], coat.matte[lit])
@@ -142,10 +147,10 @@ def draw(shown: Shown, camera: Camera, width: int, height: int, background: Colo
 
     def seen(directions: Floats) -> Colors:
         layers = layers_of(shown, camera.eye, directions)
-        if shown.plain or shown.local or shown.trust:
+        if shown.matte or shown.local or shown.trust:
             return composed(shown, layers, background)
         return composed(shown, layers, background, None, [coat(layer, directions) for layer in layers])
 
-    if not (shown.plain or shown.trust):
+    if not (shown.matte or shown.trust):
         shown.sight  # noqa: B018  before threads ask for it
     return traced(seen, camera, width, height)
