@@ -11,6 +11,7 @@ from illumgrid.field.lattice import specs_over
 from illumgrid.field.scene import Field, Scene, level_table
 from illumgrid.field.volume import Volume
 from illumgrid.grid import channels_of
+from illumgrid.grid.nodes import reachable
 from illumgrid.io import exports, needs
 from shapes import ball, lit, sky
 
@@ -40,7 +41,11 @@ def test_a_grid_beyond_memory_is_refused_with_one_that_fits(call, free):
 def test_nodes_that_no_isosurface_of_the_range_meets_take_little():
     scene = Scene.sky(ball(20), range=(0.5, 0.52))
     wide = Scene.sky(ball(20), range=(0.05, 0.95))
-    assert needs._share(scene.fields[0]) < 0.2 * needs._share(wide.fields[0])
+    for tested in (scene, wide):
+        (spec,) = specs_over(tested, 20)
+        asked = len(reachable(tested.fields[0], spec)) / np.prod(spec.shape)
+        assert needs._share(tested.fields[0], spec) == pytest.approx(asked, abs=0.1)
+    assert needs._share(scene.fields[0], spec) < 0.4 * needs._share(wide.fields[0], spec)
 
 
 def test_a_denser_grid_and_layers_of_light_are_counted(free):
