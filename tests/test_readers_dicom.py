@@ -12,7 +12,7 @@ import pytest
 from pydicom.uid import JPEG2000Lossless, RLELossless
 
 from dicom_files import AXES, HOUNSFIELD, SHAPE, START, STEP, X, Y, Z, enhanced, image, item, place, series
-from illumgrid.errors import IllumgridWarning
+from illumgrid.errors import BadInput, IllumgridWarning
 from illumgrid.field.volume import index_to_world
 from illumgrid.io.readers import read_volume
 from volume_files import ORIGIN, SPACING, TURN, refused, refused_lightly, values, write, write_series, zipped
@@ -77,6 +77,35 @@ def test_values_stay_as_small_as_the_pixels(tmp_path):
     field = np.round((HOUNSFIELD + 1024) / 0.3) * 0.3 - 1024
     scaled = read(series(tmp_path / "b", field, slope=0.3))
     assert scaled.stored.dtype == np.uint16 and np.allclose(scaled.values, field, rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize("slopes", [False, True])
+@pytest.mark.parametrize("one_file", [False, True])
+def test_a_part_is_read_as_a_part(tmp_path, one_file, slopes):
+    scale = np.array([0.5 + 0.5 * k if slopes else 1.0 for k in range(7)])
+    field = np.round((HOUNSFIELD + 1024) / scale) * scale - 1024
+    if one_file:
+        path = enhanced(tmp_path / "a.dcm", [3, 0, 5, 1, 6, 2, 4], [field] * 7, slope=lambda k: scale[k])
+    else:
+        path = series(tmp_path / "a", field, slope=lambda k: scale[k], intercept=lambda k: -1024)
+        for k in (0, 1, 6):  # those outside are not unpacked
+            file = path / f"{9 - k}.dcm"
+            file.write_bytes(file.read_bytes()[:-9])
+    crop = (1, 5, 0, 5, 2, 6)
+    part = read(path, crop=crop)
+    assert np.allclose(part.values, field[1:5, :5, 2:6]) and np.allclose(part.origin, place([1, 0, 2]))
+    assert part.stored.itemsize == (4 if slopes else 2)
+    half = read(path, crop=crop, downsample=2)
+    assert np.allclose(half.values, field[1:5, :4, 2:6].reshape(2, 2, 2, 2, 2, 2).mean(axis=(1, 3, 5)), rtol=1e-6)
+    assert np.allclose(half.origin, place([1.5, 0.5, 2.5])) and np.allclose(half.spacing, 2 * STEP)
+    with pytest.raises(BadInput, match="--crop is 0 5 0 6 0 8; expected"):
+        read_volume(path, crop=(0, 5, 0, 6, 0, 8))
+
+
+def test_a_part_of_slices_between_which_one_is_missing(tmp_path):
+    path = series(tmp_path / "a", ks=[0, 1, 2, 4, 5, 6])
+    part = read(path, "slices are missing", crop=(0, 5, 1, 6, 4, 7))
+    assert np.allclose(part.values, HOUNSFIELD[:, 1:, 4:]) and np.allclose(part.origin, place([0, 1, 4]))
 
 
 def test_sub_folders_and_what_else_lies_there(tmp_path):

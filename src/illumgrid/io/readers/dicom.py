@@ -14,12 +14,13 @@ import pydicom
 
 from illumgrid.errors import BadInput
 from illumgrid.io.readers.dicom_frames import Frame, frames_of, text
-from illumgrid.io.readers.dicom_pixels import dataset, decoded, on_lattice, planes_of, quiet, scaled, understood
+from illumgrid.io.readers.dicom_pixels import dataset, decoded, on_lattice, planes_of, quiet, understood
 from illumgrid.io.readers.dicom_stack import REPEAT, arranged, phases, placed, stacks
 from illumgrid.io.readers.families import bare_dicom
 from illumgrid.io.readers.limits import AS_FLOAT, check_axes, check_memory
 from illumgrid.io.readers.source import Source, find_source
 from illumgrid.io.readers.stored import Note, Stored, Wanted, pick
+from illumgrid.io.readers.windows import Span
 
 MOST_FILES = 200_000
 """Files in a folder that are looked at: no series has more."""
@@ -126,10 +127,11 @@ def _chosen(frames: Sequence[Frame], wanted: Wanted, sources: dict[Path, Source]
     kind = stack.frames[0].kind
     shape = (kind.columns, kind.rows, stack.count)
     check_axes(shape)
-    planes, more = planes_of(stack, sources, wanted)
-    values, slope, intercept = scaled(planes, stack)
-    values = on_lattice(values, stack).transpose(2, 1, 0)
-    return Stored(values, stack.origin, stack.steps, slope, intercept, unit="mm", notes=(*notes, *stack.notes, *more))
+    spans = wanted.spans(shape) if stack.even else [Span(0, n) for n in (kind.columns, kind.rows, len(stack.frames))]
+    planes, slope, intercept, more = planes_of(stack, sources, wanted, spans)
+    values = (planes if stack.even else on_lattice(planes, stack)).transpose(2, 1, 0)
+    notes, whole = [*notes, *stack.notes, *more], shape if stack.even else None
+    return Stored(values, stack.origin, stack.steps, slope, intercept, unit="mm", notes=tuple(notes), whole=whole)
 
 
 def _series(frames: Sequence[Frame], wanted: Wanted) -> tuple[list[Frame], list[Note]]:

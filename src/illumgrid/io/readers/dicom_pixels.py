@@ -20,6 +20,7 @@ from illumgrid.io.readers.dicom_stack import Stack
 from illumgrid.io.readers.limits import AS_FLOAT, check_memory, check_size
 from illumgrid.io.readers.source import AGAIN, Source, opened, seekable
 from illumgrid.io.readers.stored import Note, Wanted, pick
+from illumgrid.io.readers.windows import Span, means, sums, take
 
 MOST_PACKED = 1 << 14
 """Times its file that a compressed image can unpack to: an empty slice of JPEG-LS takes some hundred bytes."""
@@ -83,31 +84,47 @@ def _check_deflated(stream: Any, source: Source) -> None:
     stream.seek(0)
 
 
-def planes_of(stack: Stack, sources: dict[Path, Source], wanted: Wanted) -> tuple[NDArray[Any], list[Note]]:
-    """Stored values (n, rows, columns) of the frames of a stack, in its order."""
-    kind = stack.frames[0].kind
-    files = list(dict.fromkeys(frame.file for frame in stack.frames))
-    cells = len(stack.frames) * kind.rows * kind.columns
-    held = sum(sources[file].most for file in files)
-    promised = cells * kind.samples * kind.bits // 8
-    check_size(promised, held * MOST_PACKED, cells * (max(8, kind.bits) // 8 * 2 + AS_FLOAT))
+def planes_of(
+    stack: Stack, sources: dict[Path, Source], wanted: Wanted, spans: Sequence[Span]
+) -> tuple[NDArray[Any], float, float, list[Note]]:
+    """A part of the frames of a stack, in its order: values (n, rows, columns), slope, intercept, and notes.
+
+    Values are as stored where all frames have one slope and intercept, else as these make them. `spans` are along x, y
+    and z; frames outside are not unpacked, those of other files not opened.
+    """
+    across, down, along = spans
+    frames, kind = stack.frames[along.first : along.first + along.count * along.block], stack.frames[0].kind
+    files = list(dict.fromkeys(frame.file for frame in frames))
+    held, plane_size = sum(sources[file].most for file in files), kind.rows * kind.columns
+    each = max(8, kind.bits) // 8 * 2 + AS_FLOAT if along.block == 1 else 12
+    need = across.count * down.count * along.count * each + 16 * plane_size
+    check_size(len(frames) * plane_size * kind.samples * kind.bits // 8, held * MOST_PACKED, need)
     _check_colours(kind.samples, kind.colours, wanted)
-    planes: NDArray[Any] | None = None
+    scales = [(frame.slope, frame.intercept) for frame in frames]
+    alike, averaged = len(set(scales)) == 1, along.block > 1
+    out: NDArray[Any] | None = None
     notes: list[Note] = []
     for file in files:
-        slots = {frame.index: k for k, frame in enumerate(stack.frames) if frame.file == file}
+        slots = {frame.index: k for k, frame in enumerate(frames) if frame.file == file}
         for index, plane in decoded(sources[file], sorted(slots), kind, notes):
             if kind.samples > 1:
                 plane = plane[..., pick(wanted.channel, "channel", ["red", "green", "blue"][: kind.samples])]
-            if planes is None:
-                planes = np.zeros((len(stack.frames), kind.rows, kind.columns), plane.dtype)
-            if plane.shape != planes.shape[1:]:
-                raise BadInput(f"{file.name} unpacks to {plane.shape} pixels; expected {planes.shape[1:]}; {AGAIN}")
-            if plane.dtype != planes.dtype:
-                planes = planes.astype(np.result_type(planes.dtype, plane.dtype))
-            planes[slots[index]] = plane
-    assert planes is not None
-    return planes, notes
+            if plane.shape != (kind.rows, kind.columns):
+                expected = (kind.rows, kind.columns)
+                raise BadInput(f"{file.name} unpacks to {plane.shape} pixels; expected {expected}; {AGAIN}")
+            slope, intercept = scales[slots[index]]
+            wide = np.dtype(np.float32 if plane.itemsize <= 2 else np.float64)  # for slices that are scaled each
+            kept = plane.dtype if alike else wide
+            plane = plane if alike else plane * slope + intercept
+            part = sums(plane, (down, across)) if averaged else take(plane, (down, across))
+            if out is None:
+                out = np.zeros((along.count, *part.shape), float if averaged else kept)
+            elif not averaged and kept != out.dtype:
+                out = out.astype(np.result_type(out.dtype, kept))
+            out[slots[index] // along.block] += part.astype(out.dtype, copy=False)
+    assert out is not None
+    values = means(out, spans, kept) if averaged else out
+    return (values, *(scales[0] if alike else (1.0, 0.0)), notes)
 
 
 def _check_colours(samples: int, colours: str, wanted: Wanted) -> None:
@@ -187,24 +204,9 @@ def _real(plane: NDArray[Any], data: Any) -> NDArray[Any]:
     return plane
 
 
-def scaled(planes: NDArray[Any], stack: Stack) -> tuple[NDArray[Any], float, float]:
-    """Stored values with the one slope and intercept of all slices; or, where these differ, the values themselves."""
-    scales = np.array([(frame.slope, frame.intercept) for frame in stack.frames])
-    if (scales == scales[0]).all():
-        return planes, float(scales[0, 0]), float(scales[0, 1])
-    kind = np.float32 if planes.dtype.itemsize <= 2 else np.float64
-    check_memory(planes.size * kind().itemsize * 2)
-    out = np.empty(planes.shape, kind)
-    for plane, scaled, (slope, intercept) in zip(planes, out, scales):
-        scaled[...] = plane * slope + intercept
-    return out, 1.0, 0.0
-
-
 def on_lattice(planes: NDArray[Any], stack: Stack) -> NDArray[Any]:
     """Slices at every place of the even lattice: those that are there, others between their neighbours."""
     at = stack.at
-    if len(at) == stack.count and np.abs(at - np.arange(stack.count)).max() < 1e-3:
-        return planes
     check_memory(stack.count * planes[0].size * planes.itemsize)
     out = np.empty((stack.count, *planes.shape[1:]), planes.dtype)
     for k in range(stack.count):

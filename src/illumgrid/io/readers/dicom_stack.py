@@ -38,6 +38,11 @@ class Stack:
     """(3, 3): column i is the world vector from a voxel to its neighbour along axis i; a gantry tilt shears it."""
     notes: tuple[Note, ...]
 
+    @property
+    def even(self) -> bool:
+        """Whether there is one frame at each place of the lattice."""
+        return len(self.at) == self.count and bool(np.abs(self.at - np.arange(self.count)).max() < 1e-3)
+
 
 def stacks(frames: Sequence[Frame]) -> list[list[Frame]]:
     """Frames that one volume could hold: of one series, size and orientation; in the order of series numbers."""

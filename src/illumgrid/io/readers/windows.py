@@ -49,10 +49,11 @@ def take(values: NDArray[Any], spans: Sequence[Span]) -> NDArray[Any]:
     """The part of an array."""
     if all(span.block == 1 for span in spans):
         return values[tuple(slice(span.first, span.last) for span in spans)]
-    return _means(_sums(values, spans), spans, values.dtype)
+    return means(sums(values, spans), spans, values.dtype)
 
 
-def _sums(values: NDArray[Any], spans: Sequence[Span]) -> NDArray[np.float64]:
+def sums(values: NDArray[Any], spans: Sequence[Span]) -> NDArray[np.float64]:
+    """The part of an array, summed over its blocks."""
     part = values[tuple(slice(span.first, span.first + span.count * span.block) for span in spans)]
     total = np.zeros([span.count for span in spans])
     for offset in np.ndindex(*(span.block for span in spans)):
@@ -60,9 +61,10 @@ def _sums(values: NDArray[Any], spans: Sequence[Span]) -> NDArray[np.float64]:
     return total
 
 
-def _means(sums: NDArray[np.float64], spans: Sequence[Span], dtype: np.dtype[Any]) -> NDArray[Any]:
-    sums /= math.prod(span.block for span in spans)
-    return sums if dtype.kind == "f" and dtype.itemsize == 8 else sums.astype(np.float32)
+def means(total: NDArray[np.float64], spans: Sequence[Span], dtype: np.dtype[Any]) -> NDArray[Any]:
+    """Sums over blocks as means of values of a type, in single precision unless that is double."""
+    total /= math.prod(span.block for span in spans)
+    return total if dtype.kind == "f" and dtype.itemsize == 8 else total.astype(np.float32)
 
 
 def read_part(
@@ -89,11 +91,11 @@ def read_part(
         index = np.unravel_index(number, outer, order="F")
         place: Any = tuple((int(k) - span.first) // span.block for k, span in zip(index, slow))
         if averaged:
-            out[(..., *place)] += _sums(values, fast)
+            out[(..., *place)] += sums(values, fast)
         else:
             out[(..., *place)] = take(values, fast)
     skip(stream, (math.prod(outer) - at) * width)
-    return _means(out, spans, kind) if averaged else out
+    return means(out, spans, kind) if averaged else out
 
 
 def _wanted(shape: Sequence[int], spans: Sequence[Span]) -> list[int]:
@@ -118,4 +120,4 @@ def join(plane: Callable[[int], NDArray[Any]], span: Span) -> NDArray[Any]:
             out = np.zeros((*one.shape, span.count), kind, order="F")
         out[..., (number - span.first) // span.block] += one
     assert out is not None
-    return out if span.block == 1 else _means(out, [span], one.dtype)
+    return out if span.block == 1 else means(out, [span], one.dtype)
