@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from illumgrid import registry
 from illumgrid.bake import wall_texture
-from illumgrid.bake.targets import coarse_first, held_queries, of_field, wall_queries
+from illumgrid.bake.targets import coarse_first, held_queries, node_queries, of_field, wall_queries
 from illumgrid.errors import BadInput
 from illumgrid.field.lattice import specs_over
 from illumgrid.field.scene import level_table
@@ -58,7 +58,7 @@ def load(place: Path) -> tuple[Illumination, float]:
         )
         specs = specs_over(scene, chosen["grid"])
         levels = level_table(scene, about["isovalues"] or 32)
-        nodes = [q for q in sampler.queries(scene, specs, about["seed"]) if len(q)]
+        nodes = node_queries(scene, specs, sampler, about["seed"])
         held = held_queries(scene, nodes)
         targets = nodes + held + wall_queries(scene, levels)
         order = in_order([coarse_first(scene, specs, levels, batch) for batch in targets])

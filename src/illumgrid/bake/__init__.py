@@ -7,7 +7,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from illumgrid.bake.accumulator import Bake, Map, Progress
-from illumgrid.bake.targets import HELD_ROWS, coarse_first, held_queries, of_field, texel_paths, wall_queries
+from illumgrid.bake.targets import (
+    HELD_ROWS,
+    coarse_first,
+    held_queries,
+    node_queries,
+    of_field,
+    texel_paths,
+    wall_queries,
+)
 from illumgrid.field.scene import Levels, Quad, Scene
 from illumgrid.field.volume import interpolate, world_to_index
 from illumgrid.grid import GridSpec, IlluminationGrid, Nodes, WallTexture, fill_holes
@@ -125,7 +133,7 @@ def bake(
         Keeps the light as it is computed, from coarse to fine, and knows that of a run that was stopped.
     """
     clock = [time.perf_counter()]
-    nodes = [batch for batch in sampler.queries(scene, specs, seed) if len(batch)]
+    nodes = node_queries(scene, specs, sampler, seed)
     texels = wall_queries(scene, levels)
     asked, on_walls = (sum(len(batch) for batch in batches) for batches in (nodes, texels))
     more = texel_paths(asked, on_walls)
@@ -140,6 +148,7 @@ def bake(
         state = state.walk(tracer, numbers, map, progress, keep, ranks)
     if keep is not None and state.answers:
         keep.end(state.answers)
+    del ranks
     clock.append(time.perf_counter())
 
     grids, walked = [], state.paths

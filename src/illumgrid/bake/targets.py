@@ -8,10 +8,21 @@ from numpy.typing import NDArray
 from illumgrid.field.scene import Levels, Scene
 from illumgrid.field.volume import world_to_index
 from illumgrid.grid import GridSpec, channels_of
+from illumgrid.samplers.direct import Direct, NodeQueries
+from illumgrid.stages import Sampler
 from illumgrid.transport.samples import Queries, Samples, join_queries, join_samples
 
 HELD_ROWS = 5
 """Places of the sweep, its ends among them, at which a level that is held is lit."""
+
+
+def node_queries(scene: Scene, specs: Sequence[GridSpec], sampler: Sampler, seed: int) -> list[Queries]:
+    """What a sampler asks; of `Direct` only the numbers of nodes are held, and queries for one piece at a time."""
+    if type(sampler) is Direct and all(field.isovalue is None for field in scene.fields):
+        batches = [NodeQueries(scene, number, spec) for number, spec in enumerate(specs)]
+    else:
+        batches = list(sampler.queries(scene, specs, seed))
+    return [batch for batch in batches if len(batch)]
 
 
 def wall_queries(scene: Scene, levels: Levels) -> list[Queries]:
@@ -54,6 +65,8 @@ def held_queries(scene: Scene, nodes: Sequence[Queries]) -> list[Queries]:
 
 def coarse_first(scene: Scene, specs: Sequence[GridSpec], levels: Levels, queries: Queries) -> NDArray[np.int8]:
     """Ranks (n,) of targets: 0 for every fourth node or texel along each axis, 1 for every second, 2 for the others."""
+    if isinstance(queries, NodeQueries):
+        return _rank(np.unravel_index(queries.node, queries.spec.shape))
     index = np.zeros((len(queries), 3), np.int64)
     for target in np.unique(queries.target):
         own = queries.target == target
@@ -63,7 +76,11 @@ def coarse_first(scene: Scene, specs: Sequence[GridSpec], levels: Levels, querie
             nu, nv = scene.quads[target - len(specs)].texels
             number = (queries.id[own] & np.uint64((1 << 40) - 1)).astype(np.int64)
             index[own] = np.stack(np.unravel_index(number, (len(levels.table), nv, nu)), axis=1)
-    even, fourth = ((index % step == 0).all(axis=1).astype(np.int8) for step in (2, 4))
+    return _rank(index.T)
+
+
+def _rank(index: Sequence[NDArray[np.integer]] | NDArray[np.integer]) -> NDArray[np.int8]:
+    even, fourth = (np.logical_and.reduce([axis % step == 0 for axis in index]).astype(np.int8) for step in (2, 4))
     return np.asarray(2 - even - fourth, np.int8)
 
 
@@ -79,7 +96,7 @@ def of_field(scene: Scene, answers: Sequence[Samples], number: int) -> Samples:
     """Samples of one field; a batch may hold several fields, and a field may have none."""
     own = [a if (a.queries.target == number).all() else a[a.queries.target == number] for a in answers]
     if own := [a for a in own if len(a)]:
-        return join_samples(own)
+        return own[0] if len(own) == 1 else join_samples(own)
     channels = channels_of(scene)
     none = np.zeros((0, len(channels)), np.float32)
     return Samples(Queries.at(scene, np.zeros((0, 3))), none, none, np.zeros(0, np.int32), channels)

@@ -21,11 +21,18 @@ def read_lattice(spec: Lattice, values: NDArray[np.float32], points: ArrayLike) 
 
 
 def fill_holes(spacing: ArrayLike, values: NDArray[np.float32], support: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Give nodes of support 0 the value of the nearest supported node, so that lookup is never black and never NaN."""
+    """Give nodes of support 0 the value of the nearest supported node, so that lookup is never black and never NaN.
+
+    Values (nx, ny, nz, C) that can be written to are filled where they are.
+    """
     holes = support == 0
     if not holes.any() or holes.all():
         return values
     from scipy.ndimage import distance_transform_edt
 
     nearest = distance_transform_edt(holes, sampling=np.asarray(spacing), return_distances=False, return_indices=True)
-    return np.asarray(values[tuple(nearest)])
+    filled = values if values.flags.writeable else values.copy()
+    for x in range(len(holes)):  # a slab at a time: what is read is light of nodes that are no holes
+        hole = holes[x]
+        filled[x][hole] = filled[tuple(axis[x][hole] for axis in nearest)]
+    return filled

@@ -12,7 +12,7 @@ from illumgrid.interpolators.neighbours import diagonal, near_samples
 from illumgrid.stages import Interpolator, hookimpl
 from illumgrid.transport.samples import Samples
 
-_SLAB = 1 << 18  # nodes per search: bounds the memory
+_SLAB = 1 << 16  # nodes per search: bounds the memory
 _ON_A_NODE = 1e-6  # of a spacing: no other sample is nearer
 
 
@@ -26,39 +26,50 @@ class Nearest:
         """Fill every node: see `illumgrid.stages.Interpolator`."""
         from scipy.spatial import KDTree
 
-        spec, good = nodes.spec, samples[samples.paths > 0]
+        spec, good = nodes.spec, np.flatnonzero(samples.paths > 0)
         light = np.zeros((len(nodes), samples.light.shape[1]), np.float32)
         error = np.full(len(nodes), np.inf, np.float32)
         support = np.zeros(len(nodes), np.float32)
-        errors = None if samples.errors is None else np.full(light.shape, np.inf, np.float32)
-        own_error, own_errors = good.error, good.errors
+        errors = np.full(light.shape, np.inf, np.float32) if samples.channels.mixable else None
+        nowhere = samples.queries[:0]
 
         def take(node: NDArray[np.integer], sample: NDArray[np.integer]) -> None:
-            light[node], error[node], support[node] = good.light[sample], own_error[sample], 1.0
-            if errors is not None and own_errors is not None:
-                errors[node] = own_errors[sample]
+            for first in range(0, len(node), _SLAB):
+                some, rows = node[first : first + _SLAB], good[sample[first : first + _SLAB]]
+                moments = (of[rows] for of in (samples.light, samples.spread, samples.paths))
+                own = Samples(nowhere, *moments, samples.channels)
+                light[some], error[some], support[some] = own.light, own.error, 1.0
+                if errors is not None and own.errors is not None:
+                    errors[some] = own.errors
 
         if len(good):
-            # Coordinates relative to the grid's origin: differences of large world coordinates would lose digits.
-            tree = KDTree(good.queries.point - spec.origin)
+            points = samples.queries.point if len(good) == len(samples) else samples.queries.point[good]
             reach = diagonal(spec)
-            candidates = near_samples(spec, good.queries.point, reach).reshape(-1)
-            node, sample = on_nodes(spec, good.queries.point)
+            candidates = near_samples(spec, points, reach).reshape(-1)
+            node, sample = on_nodes(spec, points)
             take(node, sample)
             candidates[node] = False
+            del node, sample
+            # Coordinates relative to the grid's origin: differences of large world coordinates would lose digits.
+            tree = KDTree(points - spec.origin)
             for block in nodes.blocks(np.flatnonzero(candidates), _SLAB):
                 distance, sample = tree.query(block.point - spec.origin, distance_upper_bound=reach)
                 near = np.isfinite(distance)
                 take(block.flat[near], sample[near])
+            del tree
         return nodes.grid(light, error, support, samples.channels, errors)
 
 
 def on_nodes(spec: GridSpec, points: Floats) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Flat numbers (m,) of the nodes that are one of the world points (n, 3), and which (m,); none that are two."""
-    index = world_to_index(spec, points)
-    closest = np.clip(np.round(index), 0, np.array(spec.shape) - 1)
-    point = np.flatnonzero((np.abs(index - closest) < _ON_A_NODE).all(axis=1))
-    node = np.ravel_multi_index(tuple(closest[point].astype(np.int64).T), spec.shape)
+    nodes, which = [], []
+    for first in range(0, len(points), _SLAB):
+        index = world_to_index(spec, points[first : first + _SLAB])
+        closest = np.clip(np.round(index), 0, np.array(spec.shape) - 1)
+        point = np.flatnonzero((np.abs(index - closest) < _ON_A_NODE).all(axis=1))
+        nodes.append(np.ravel_multi_index(tuple(closest[point].astype(np.int64).T), spec.shape))
+        which.append(first + point)
+    node, point = np.concatenate([np.zeros(0, np.int64), *nodes]), np.concatenate([np.zeros(0, np.int64), *which])
     alone = np.bincount(node, minlength=1)[node] == 1
     return node[alone], point[alone]
 

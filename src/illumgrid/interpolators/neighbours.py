@@ -27,8 +27,9 @@ def near_samples(spec: GridSpec, points: Floats, reach: float) -> NDArray[np.boo
     from scipy.ndimage import maximum_filter
 
     taken = np.zeros(spec.shape, bool)
-    closest = np.clip(np.round(world_to_index(spec, points)), 0, np.array(spec.shape) - 1).astype(np.int64)
-    taken[tuple(closest.T)] = True
+    for first in range(0, len(points), _SLAB):
+        index = np.round(world_to_index(spec, points[first : first + _SLAB]))
+        taken[tuple(np.clip(index, 0, np.array(spec.shape) - 1).astype(np.int64).T)] = True
     # A point is at most half a node spacing from the node that it is rounded to.
     width = 2 * np.ceil(reach / spec.spacing + 0.5).astype(int) + 1
     return np.asarray(maximum_filter(taken, size=tuple(width), mode="constant"))

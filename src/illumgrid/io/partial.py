@@ -29,16 +29,18 @@ from illumgrid.field.scene import Scene
 from illumgrid.grid import Channels
 from illumgrid.io import disk
 from illumgrid.io.store import MOMENTS
+from illumgrid.samplers.direct import NodeQueries
 from illumgrid.transport.samples import Queries, Samples
 from illumgrid.transport.walk import Answer
 
 Record = dict[str, Any]
 
-FORMAT = 1
+FORMAT = 2  # 1 had nodes that the projection moves in another order
 EVERY = 10.0
 """Seconds from one writing to the next, and before the first: a shorter run leaves nothing."""
 CHUNK = 4096
 """Rows of a chunk."""
+MOMENT_ARRAYS = ("light", "spread", "paths")
 SUFFIX, LIGHT, SCENE = ".partial", "light.zarr", "scene"
 MACHINE = ("versions", "processor")
 """What may differ where --any-machine is given: then light may differ in its last digits."""
@@ -128,7 +130,7 @@ class Partial:
         self.place = beside(folder)
         self.about, self.command, self.write_scene = about, command, scene
         self.chosen: Record | None = None  # by the run that is gone on with: grid, bounces, walked...
-        self.moments: Answer | None = None
+        self.moments: list[Answer] = []
         self._before: dict[str, NDArray[Any]] = {}
         self._group: Any = None
         self._lock: int | None = None
@@ -198,11 +200,12 @@ class Partial:
 
     def begin(self, targets: Sequence[Queries], order: NDArray[np.int64]) -> None:
         """See `Keeper`."""
-        self._count, self._place = len(order), np.empty(len(order), np.int64)
-        self._place[order] = np.arange(len(order))
+        self._count = len(order)
+        self._place = np.empty(len(order), np.int32 if len(order) < 1 << 31 else np.int64)
+        self._place[order] = np.arange(len(order), dtype=self._place.dtype)
         found = hashlib.sha256()
-        for queries in targets:
-            _hash(queries, found.update)
+        for queries in targets:  # the scene, whose digest is kept as well, decides where nodes are
+            _hash(queries.node if isinstance(queries, NodeQueries) else queries, found.update)
         if self._asked not in ("", found.hexdigest()):
             raise BadInput(f"{self.place} is of other points than the sampler asks about now; remove it to begin anew")
         self._asked, self._last = found.hexdigest(), time.monotonic()
@@ -239,11 +242,8 @@ class Partial:
 
     def end(self, answers: Sequence[Samples]) -> None:
         """See `Keeper`."""
-        light, spread, paths = (
-            np.concatenate([getattr(a, key) for a in answers]) for key in ("light", "spread", "paths")
-        )
-        self.moments = Answer(light, spread, paths, answers[0].channels, 0.0)
-        self._before = {}
+        self.moments = [Answer(a.light, a.spread, a.paths, a.channels, 0.0) for a in answers]  # no copy
+        self._before, self._place = {}, np.zeros(0, np.int32)
 
     def standing(self) -> str:
         """What is kept where, for a line of progress; empty before anything is."""
@@ -331,15 +331,14 @@ class Partial:
 
     def leave(self, finished: Path) -> None:
         """Give the finished run its moments, and remove the partial one."""
-        found = self.moments
-        if found is not None:
-            walked = self._walked[-1].stop
-            channels = {"names": found.channels.names, "mix": found.channels.mix}
-            about = {"identity": self.about, "chosen": self.chosen, "queries": self._asked, "channels": channels}
+        if self.moments:
+            walked, channels = self._walked[-1].stop, self.moments[0].channels
+            named = {"names": channels.names, "mix": channels.mix}
+            about = {"identity": self.about, "chosen": self.chosen, "queries": self._asked, "channels": named}
             with disk.fresh_file(finished / MOMENTS) as file:
                 np.savez_compressed(
                     file, about=np.array(json.dumps(about)), walked=np.array(walked),
-                    light=found.light, spread=found.spread, paths=found.paths,
+                    **{key: np.concatenate([getattr(a, key) for a in self.moments]) for key in MOMENT_ARRAYS},
                 )  # fmt: skip
         self.remove()
 

@@ -60,6 +60,63 @@ class Direct:
                 yield at_nodes(scene, number, spec, nodes[first : first + _BATCH])
 
 
+class NodeQueries(Queries):
+    """The queries of `Direct` at nodes of one field, of which only the nodes' numbers are kept: 4 bytes each.
+
+    Rows of it are plain queries; `point`, `normal` and `level` are computed anew, some nodes at a time, whenever they
+    are asked for.
+    """
+
+    scene: Scene
+    field: int
+    spec: GridSpec
+    node: NDArray[np.integer]
+
+    def __init__(self, scene: Scene, field: int, spec: GridSpec) -> None:
+        node = reachable(scene.fields[field], spec)
+        node = node.astype(np.int32) if np.prod(spec.shape) < 1 << 31 else node
+        for name, value in zip(("scene", "field", "spec", "node"), (scene, field, spec, node)):
+            object.__setattr__(self, name, value)
+
+    def __len__(self) -> int:
+        return len(self.node)
+
+    def __getitem__(self, rows: slice | NDArray[np.bool_] | NDArray[np.integer]) -> Queries:
+        return at_nodes(self.scene, self.field, self.spec, self.node[rows].astype(np.int64))
+
+    def _all(self, name: str) -> Floats:
+        whole = np.empty((len(self), *getattr(self[:0], name).shape[1:]))
+        for first in range(0, len(self), _BATCH):
+            some = slice(first, first + _BATCH)
+            whole[some] = getattr(self[some], name)
+        return whole
+
+    @property
+    def id(self) -> NDArray[np.uint64]:  # type: ignore[override]
+        """Flat numbers of the nodes, with that of the field above them."""
+        return self.node.astype(np.uint64) | np.uint64(self.field << 40)
+
+    @property
+    def target(self) -> NDArray[np.int32]:  # type: ignore[override]
+        """The number of the field."""
+        return np.full(len(self), self.field, np.int32)
+
+    @property
+    def point(self) -> Floats:  # type: ignore[override]
+        """Computed anew."""
+        return self._all("point")
+
+    @property
+    def normal(self) -> Floats:  # type: ignore[override]
+        """Computed anew."""
+        return self._all("normal")
+
+    @property
+    def level(self) -> Floats:  # type: ignore[override]
+        """Computed anew."""
+        return self._all("level")
+
+
 @dataclass(frozen=True, eq=False)
 class Corners:
     """The nodes that a lookup at some points reads, in a grid of `Direct` that is never built."""

@@ -95,7 +95,7 @@ class Walk:
                 while len(rows):
                     some, rows = np.split(rows, [max(1, int(self.size / max(len(paths), 1)))])
                     self.asked.append((number, some))
-                    yield queries if len(some) == len(queries) else queries[some], paths
+                    yield queries[slice(None) if len(some) == len(queries) else some], paths
 
     def take(self, found: Answer) -> tuple[int, NDArray[np.int64]]:
         """Put the answer to the piece that has waited longest in its place; returns the batch and the rows in it."""

@@ -46,7 +46,7 @@ UNREADABLE = (
 )
 """What libraries raise on a file that is not what it should be."""
 
-EXTRAS = {"SimpleITK": "itk"}
+EXTRAS = {"SimpleITK": "itk", "h5py": "hdf5"}
 """Optional packages that read whole files, and the extra that brings each."""
 
 
@@ -54,7 +54,7 @@ def volume_name(path: str | os.PathLike[str]) -> str:
     """Name of a volume as shown to users: the file's name without its known suffixes, or the folder's name."""
     file = Path(os.path.abspath(path))
     # Names on the disk are bytes: what is no UTF-8 in them cannot be printed, nor written into other files.
-    if file.is_dir():
+    if file.is_dir() and file.suffix.lower() != ".zarr":
         return os.fsencode(file.name).decode("utf-8", "replace")
     file = Path(os.fsencode(file.name).decode("utf-8", "replace"))
     bare = Path(file.stem) if file.suffix.lower() == ".gz" else file
@@ -80,8 +80,8 @@ def read_volume(
     ----------
     path : str or path-like
         NRRD, NIfTI, MetaImage, TIFF (also of ImageJ, OME, LSM), MRC/CCP4, DICOM, legacy VTK, `.vti`, Gaussian `.cube`,
-        OpenDX `.dx`, `.npy` or `.npz`, each also gzipped (`brain.nrrd.gz`); or a folder with one DICOM series or with
-        TIFF slices.
+        OpenDX `.dx`, `.npy` or `.npz`, each also gzipped (`brain.nrrd.gz`); HDF5 (extra `hdf5`); or a folder: Zarr,
+        OME-Zarr, one DICOM series, or TIFF slices.
     spacing : (3,) sequence of float, optional
         Distance between voxels along x, y, z, in place of what the file says.
     channel, time, array : int or str, optional
@@ -174,7 +174,11 @@ def _read(file: Path, wanted: Wanted) -> Stored:
 
 
 def _read_folder(folder: Path, wanted: Wanted) -> Stored:
-    """A folder of DICOM files, or else of TIFF slices."""
+    """A folder of Zarr, of DICOM files, or else of TIFF slices."""
+    if any((folder / mark).is_file() for mark in ("zarr.json", ".zarray", ".zgroup")):
+        zarr = _module(next(f for f in FAMILIES if f.name == "Zarr"))
+        found: Stored = zarr.read_folder(folder, wanted)
+        return found
     dicom, tiff = (next(f for f in FAMILIES if f.name == name) for name in ("DICOM", "TIFF"))
     slices = sorted(f for f in folder.iterdir() if f.suffix.lower() in (".tif", ".tiff"))
     plain = [f for f in slices if family_of(find_source(f)) is tiff]

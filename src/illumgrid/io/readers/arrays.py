@@ -84,7 +84,7 @@ def _read_npy(stream: IO[bytes], most: int, wanted: Wanted) -> tuple[NDArray[Any
     if not 3 <= len(shape) <= 5 or min(shape) < 1:
         check_axes(shape)
     count = int(np.prod([float(n) for n in shape]))
-    axes, spans = _three_axes(shape, wanted)
+    axes, spans = three_axes(shape, wanted)
     space = tuple(shape[axis] for axis in axes)
     check_axes(space)
     kept = wanted.spans(space)
@@ -96,7 +96,7 @@ def _read_npy(stream: IO[bytes], most: int, wanted: Wanted) -> tuple[NDArray[Any
     return values.reshape([span.count for span in kept]), space
 
 
-def _three_axes(shape: tuple[int, ...], wanted: Wanted) -> tuple[list[int], list[Span]]:
+def three_axes(shape: tuple[int, ...], wanted: Wanted) -> tuple[list[int], list[Span]]:
     """Which axes are x, y and z, and what is taken of the others.
 
     Of more than three axes `--time N` takes [N, ...], `--channel N` [..., N]; axes of length 1 are dropped.

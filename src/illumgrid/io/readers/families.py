@@ -62,7 +62,13 @@ FAMILIES = (
     Family("VTK image", "vti", (".vti",), ((0, b"<VTKFile"), (0, b"<?xml")), ("channel", "array")),
     Family("Gaussian cube", "cube", (".cube", ".cub"), chooses=("array",)),
     Family("OpenDX", "dx", (".dx",)),
-    Family("ITK", "itk", (".gipl", ".h5", ".hdf5"), ((0, b"\x89HDF\r\n\x1a\n"),)),
+    Family(
+        *("HDF5", "hdf5", (".h5", ".hdf5", ".hdf", ".nc")),
+        starts=((0, b"\x89HDF\r\n\x1a\n"),),
+        chooses=("channel", "time", "array"),
+    ),
+    Family("Zarr", "zarr", (".zarr",), chooses=("channel", "time", "array")),
+    Family("ITK", "itk", (".gipl",)),
 )
 """In the order in which they are tried."""
 
@@ -88,8 +94,8 @@ OTHERS = {
 """Beginnings of files of other kinds, and what those are."""
 
 EXPECTED = (
-    "expected NRRD, NIfTI, MetaImage, TIFF, MRC, legacy VTK, .vti, .cube, .dx, .npy or .npz, or a folder of DICOM or "
-    "TIFF slices"
+    "expected NRRD, NIfTI, MetaImage, TIFF, MRC, legacy VTK, .vti, .cube, .dx, .npy, .npz or HDF5, or a folder of "
+    "Zarr, or of DICOM or TIFF slices"
 )
 
 SUFFIXES = {ending for family in FAMILIES for ending in family.endings}

@@ -18,6 +18,7 @@ from numpy.typing import DTypeLike, NDArray
 
 from illumgrid.errors import BadInput
 from illumgrid.io.readers.limits import CHUNK, DEFLATE, check_memory
+from illumgrid.io.readers.paged import mapped, room
 
 AGAIN = "expected a whole file; copy or write it again"
 
@@ -178,8 +179,13 @@ class _Zlib(io.RawIOBase):
 def read_array(
     stream: IO[bytes], dtype: DTypeLike, shape: Sequence[int], order: Literal["C", "F"] = "F"
 ) -> NDArray[Any]:
-    """The next prod(shape) numbers of a stream, or a refusal where it ends before; call `check_size` first."""
-    flat = np.zeros(math.prod(shape), dtype)
+    """The next prod(shape) numbers of a stream, or a refusal where it ends before; call `check_size` first.
+
+    What is larger than a quarter of the free memory is paged: see `illumgrid.io.readers.paged`.
+    """
+    if (whole := mapped(stream, dtype, math.prod(shape))) is not None:
+        return whole.reshape(tuple(shape), order=order)
+    flat = room([math.prod(shape)], dtype)
     raw = memoryview(flat.view(np.uint8))  # type: ignore[arg-type]
     done = 0
     while done < len(raw):

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from illumgrid.errors import BadInput
 from illumgrid.field.volume import NATIVE, Floats, Volume
 from illumgrid.io.readers.limits import AS_FLOAT, check_axes, check_memory
+from illumgrid.io.readers.paged import resident, settled
 from illumgrid.io.readers.windows import Span, take
 
 Choice = int | str | None
@@ -163,10 +164,12 @@ def place(stored: Stored) -> tuple[Volume, tuple[Note, ...]]:
         )
     u, _, v = np.linalg.svd(direction)
     exact = direction if skew < 1e-14 else u @ v
-    small = stored.values.dtype.newbyteorder("=") in NATIVE
-    check_memory(stored.values.size * (stored.values.itemsize if small else 8 + AS_FLOAT))
+    values = stored.values
+    small = values.dtype.newbyteorder("=") in NATIVE
+    check_memory(resident(values.nbytes) if small else values.size * (8 + AS_FLOAT))
+    values = settled(values) if small else values
     volume = Volume(
-        stored.values, stored.origin, spacing, exact, slope=stored.slope, intercept=stored.intercept, unit=stored.unit
+        values, stored.origin, spacing, exact, slope=stored.slope, intercept=stored.intercept, unit=stored.unit
     )
     return volume, notes
 

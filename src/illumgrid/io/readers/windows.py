@@ -11,6 +11,7 @@ from typing import IO, Any, Literal
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+from illumgrid.io.readers.paged import resident
 from illumgrid.io.readers.source import read_array, skip
 
 SLAB = 1 << 16
@@ -40,7 +41,7 @@ def need(dtype: DTypeLike, shape: Sequence[int], spans: Sequence[Span]) -> int:
     """Bytes of memory that `read_part` takes."""
     kept, width = math.prod(span.count for span in spans), np.dtype(dtype).itemsize
     if all(span == Span(0, n) for span, n in zip(spans, shape)):
-        return kept * width
+        return resident(kept * width)
     averaged = any(span.block > 1 for span in spans)
     return kept * (12 if averaged else width) + (2 * SLAB + max(shape[0] * shape[-1], 1)) * (8 + width)
 

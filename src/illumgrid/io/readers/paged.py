@@ -1,0 +1,86 @@
+"""Arrays larger than a quarter of the free memory: a raw file itself, or a file without a name, paged by the system."""
+
+import io
+import math
+import os
+import shutil
+from collections.abc import Sequence
+from tempfile import TemporaryFile, gettempdir
+from typing import IO, Any, Literal
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+from illumgrid.errors import BadInput
+from illumgrid.io.readers.limits import CHUNK, free_memory, gigabytes
+
+SHARE = 4
+"""An array is kept in memory up to one part in so many of what is free."""
+
+TURNED = 1 << 28
+"""Bytes of an array that are turned at a time, where axes are exchanged."""
+
+
+def resident(size: int) -> int:
+    """Bytes of memory that an array of so many takes: what is paged takes none that others could not have."""
+    return size if size <= free_memory() // SHARE else CHUNK
+
+
+def room(shape: Sequence[int], dtype: DTypeLike, order: Literal["C", "F"] = "C") -> NDArray[Any]:
+    """Zeros; a large array lies in the folder for temporary files, without a name, and goes with the process.
+
+    Raises
+    ------
+    BadInput
+        If neither memory nor disk have room for it.
+    """
+    size = math.prod(map(int, shape)) * np.dtype(dtype).itemsize
+    if size == 0 or resident(size) == size:
+        return np.zeros(tuple(shape), dtype, order)
+    place = gettempdir()
+    if size > shutil.disk_usage(place).free:
+        raise BadInput(
+            f"needs {gigabytes(size)}, of which neither the memory nor {place} have as much; expected less; set "
+            "TMPDIR to a larger disk, or read a part with --crop or means over voxels with --downsample"
+        )
+    with TemporaryFile(prefix="illumgrid-") as file:
+        if hasattr(os, "posix_fallocate"):
+            os.posix_fallocate(file.fileno(), 0, size)  # a disk that fills up later would end the process
+        else:
+            file.truncate(size)
+        return np.asarray(np.memmap(file, dtype, "r+", shape=tuple(shape), order=order))  # type: ignore[call-overload]
+
+
+def mapped(stream: IO[bytes], dtype: DTypeLike, count: int) -> NDArray[Any] | None:
+    """The next numbers of a raw file, (count,), read-only, which the system reads when they are looked at.
+
+    None where that is not possible, or where they fit into memory: a file that others change meanwhile is then read
+    once. The stream is behind them.
+    """
+    kind = np.dtype(dtype)
+    plain = isinstance(stream, io.BufferedReader) and isinstance(stream.raw, io.FileIO)
+    if not plain or not kind.isnative or resident(count * kind.itemsize) == count * kind.itemsize:
+        return None
+    first = stream.tell()
+    if first % kind.itemsize or first + count * kind.itemsize > os.fstat(stream.fileno()).st_size:
+        return None
+    found = np.memmap(stream, kind, "r", first, (count,))  # type: ignore[call-overload]
+    stream.seek(first + count * kind.itemsize)
+    return np.asarray(found)
+
+
+def settled(values: NDArray[Any]) -> NDArray[Any]:
+    """The same values in C order and in the byte order of this machine; a large array is turned a part at a time.
+
+    What fits into memory stays as it is: others turn it.
+    """
+    native = values.dtype.newbyteorder("=")
+    if (values.flags.c_contiguous and values.dtype.isnative) or resident(values.nbytes) == values.nbytes:
+        return values
+    out = room(values.shape, native)
+    slow = int(np.argmax([abs(step) for step in values.strides]))
+    rows = max(1, TURNED // max(1, values.nbytes // values.shape[slow]))
+    for first in range(0, values.shape[slow], rows):
+        some: Any = tuple(slice(first, first + rows) if axis == slow else slice(None) for axis in range(values.ndim))
+        out[some] = values[some]
+    return out
