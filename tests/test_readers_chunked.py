@@ -7,7 +7,7 @@ import zarr
 
 import illumgrid as ig
 from illumgrid.field.volume import index_to_world
-from illumgrid.io.readers import chunked, paged, read_volume
+from illumgrid.io.readers import chunked, limits, paged, read_volume
 from volume_files import refused
 
 RANDOM = np.random.default_rng(0).integers(0, 255, (11, 9, 13)).astype(np.uint8)
@@ -158,7 +158,8 @@ def test_hdf5_whose_numbers_lie_elsewhere_is_refused(tmp_path):
 @pytest.fixture
 def little(monkeypatch):
     """So little memory that each array is paged."""
-    monkeypatch.setattr(paged, "free_memory", lambda: 400)
+    monkeypatch.setattr(limits, "free_memory", lambda: 10_000_000)
+    monkeypatch.setattr(paged, "SHARE", 100_000)
 
 
 def is_paged(values):
@@ -184,7 +185,8 @@ def test_a_paged_field_has_the_light_of_one_in_memory(tmp_path, monkeypatch):
     zarr_array(tmp_path / "a.zarr", values)
     options = {"grid": 6, "paths": 2, "bounces": 1, "judge": False}
     light = [ig.run(ig.Scene.sky(read_volume(tmp_path / "a.zarr"), range=(60, 150)), **options)]
-    monkeypatch.setattr(paged, "free_memory", lambda: 400)
+    monkeypatch.setattr(limits, "free_memory", lambda: 10_000_000)
+    monkeypatch.setattr(paged, "SHARE", 100_000)
     field = read_volume(tmp_path / "a.zarr")
     assert is_paged(field.values)
     light.append(ig.run(ig.Scene.sky(field, range=(60, 150)), **options))

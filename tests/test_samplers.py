@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from illumgrid.bake.targets import node_queries
 from illumgrid.field.scene import Field, Scene, level_table
 from illumgrid.field.volume import Volume, interpolate, world_to_index
 from illumgrid.grid import GridSpec
 from illumgrid.grid.nodes import reachable
 from illumgrid.samplers import direct
-from illumgrid.samplers.direct import Direct
+from illumgrid.samplers.direct import Direct, NodeQueries
 from illumgrid.samplers.uniform import Uniform
 from illumgrid.stages import Sampler, on_level_sets
 from illumgrid.transport.samples import join_queries
@@ -117,6 +118,24 @@ def test_direct_queries_of_two_fields_have_ids_of_their_own_and_come_in_batches(
         # the other slider stands at the same place of the sweep
         share = [(own.level[:, g] - fields[g].range[0]) / np.ptp(fields[g].range) for g in (0, 1)]
         np.testing.assert_allclose(share[0], share[1], atol=1e-9)
+
+
+def test_nodes_whose_numbers_alone_are_kept_ask_what_direct_asks(monkeypatch):
+    fields = (Field("a", ball(8), range=(0.2, 0.6)), Field("b", ball(10), range=(0.5, 1.0)))
+    scene = Scene(fields, background=np.ones(3))
+    specs = [GridSpec.over(f.volume, n) for f, n in zip(fields, (5, 6))]  # coarser than the field: rim nodes move
+    whole = asked(Direct(), scene, specs)
+    monkeypatch.setattr(direct, "_BATCH", 50)
+    kept = node_queries(scene, specs, Direct(), 0)
+    assert [type(batch) for batch in kept] == [NodeQueries, NodeQueries]
+    joined, rows = join_queries(kept), np.arange(3, 90, 7)
+    some = [batch[np.arange(3, len(batch), 7)] for batch in kept]
+    for name in ("id", "point", "normal", "level", "target"):
+        assert np.array_equal(getattr(joined, name), getattr(whole, name))
+        assert np.array_equal(getattr(some[0], name)[: len(rows)], getattr(whole, name)[rows])
+    assert sum(a.nbytes for batch in kept for a in vars(batch).values() if isinstance(a, np.ndarray)) == 4 * len(whole)
+    held = Scene((fields[0], Field("b", ball(10), range=(0.5, 1.0), isovalue=0.7)), background=np.ones(3))
+    assert NodeQueries not in map(type, node_queries(held, specs, Direct(), 0))
 
 
 # Uniform

@@ -19,7 +19,7 @@ HELD_ROWS = 5
 def node_queries(scene: Scene, specs: Sequence[GridSpec], sampler: Sampler, seed: int) -> list[Queries]:
     """What a sampler asks; of `Direct` only the numbers of nodes are held, and queries for one piece at a time."""
     if type(sampler) is Direct and all(field.isovalue is None for field in scene.fields):
-        batches = [NodeQueries(scene, number, spec) for number, spec in enumerate(specs)]
+        batches: list[Queries] = [NodeQueries(scene, number, spec) for number, spec in enumerate(specs)]
     else:
         batches = list(sampler.queries(scene, specs, seed))
     return [batch for batch in batches if len(batch)]

@@ -14,6 +14,7 @@ import typer
 from illumgrid.cli.bench import bench
 from illumgrid.cli.density import density
 from illumgrid.cli.export import export
+from illumgrid.cli.heap import return_what_is_freed
 from illumgrid.cli.info import info
 from illumgrid.cli.plugins import plugins
 from illumgrid.cli.preview import preview
@@ -61,6 +62,7 @@ def main() -> None:
         if isinstance(stream, io.TextIOWrapper):  # what the terminal or the pipe has no sign for is written as \\u00fc
             stream.reconfigure(errors="backslashreplace")
     say_what_compiles()
+    return_what_is_freed()
     code = guarded(lambda: app(standalone_mode=False))
     for number in stops:  # nothing is left but the end of the threads
         signal.signal(number, signal.SIG_IGN)

@@ -36,8 +36,8 @@ class Nearest:
         def take(node: NDArray[np.integer], sample: NDArray[np.integer]) -> None:
             for first in range(0, len(node), _SLAB):
                 some, rows = node[first : first + _SLAB], good[sample[first : first + _SLAB]]
-                moments = (of[rows] for of in (samples.light, samples.spread, samples.paths))
-                own = Samples(nowhere, *moments, samples.channels)
+                light_of, spread = samples.light[rows], samples.spread[rows]
+                own = Samples(nowhere, light_of, spread, samples.paths[rows], samples.channels)
                 light[some], error[some], support[some] = own.light, own.error, 1.0
                 if errors is not None and own.errors is not None:
                     errors[some] = own.errors

@@ -134,7 +134,8 @@ class Partial:
         self._before: dict[str, NDArray[Any]] = {}
         self._group: Any = None
         self._lock: int | None = None
-        self._new: list[tuple[range, NDArray[np.int64], Answer]] = []
+        self._new: list[tuple[range, NDArray[Any], Answer]] = []
+        self._place: NDArray[Any] = np.zeros(0, np.int64)
         self._last = time.monotonic()
         self._walked: list[range] = []
         self._stored, self._count, self._asked = 0, 0, ""
@@ -335,11 +336,9 @@ class Partial:
             walked, channels = self._walked[-1].stop, self.moments[0].channels
             named = {"names": channels.names, "mix": channels.mix}
             about = {"identity": self.about, "chosen": self.chosen, "queries": self._asked, "channels": named}
+            arrays: Any = {key: np.concatenate([getattr(a, key) for a in self.moments]) for key in MOMENT_ARRAYS}
             with disk.fresh_file(finished / MOMENTS) as file:
-                np.savez_compressed(
-                    file, about=np.array(json.dumps(about)), walked=np.array(walked),
-                    **{key: np.concatenate([getattr(a, key) for a in self.moments]) for key in MOMENT_ARRAYS},
-                )  # fmt: skip
+                np.savez_compressed(file, about=np.array(json.dumps(about)), walked=np.array(walked), **arrays)
         self.remove()
 
     def remove(self) -> None:

@@ -92,27 +92,27 @@ class NodeQueries(Queries):
         return whole
 
     @property
-    def id(self) -> NDArray[np.uint64]:  # type: ignore[override]
+    def id(self) -> NDArray[np.uint64]:
         """Flat numbers of the nodes, with that of the field above them."""
         return self.node.astype(np.uint64) | np.uint64(self.field << 40)
 
     @property
-    def target(self) -> NDArray[np.int32]:  # type: ignore[override]
+    def target(self) -> NDArray[np.int32]:
         """The number of the field."""
         return np.full(len(self), self.field, np.int32)
 
     @property
-    def point(self) -> Floats:  # type: ignore[override]
+    def point(self) -> Floats:
         """Computed anew."""
         return self._all("point")
 
     @property
-    def normal(self) -> Floats:  # type: ignore[override]
+    def normal(self) -> Floats:
         """Computed anew."""
         return self._all("normal")
 
     @property
-    def level(self) -> Floats:  # type: ignore[override]
+    def level(self) -> Floats:
         """Computed anew."""
         return self._all("level")
 

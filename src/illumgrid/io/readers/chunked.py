@@ -68,7 +68,7 @@ def read_box(
     if kind.kind not in "biuf":
         raise BadInput(f"the values have dtype {kind}; expected real numbers; save the magnitude or one component")
     check_axes([array.shape[axis] for axis in axes])
-    check_memory(2 * math.prod(chunks) * kind.itemsize + AT_ONCE)
+    check_memory(2 * math.prod(chunks) * kind.itemsize + min(AT_ONCE, math.prod(array.shape) * kind.itemsize))
     averaged = any(span.block > 1 for span in spans)
     mean = np.dtype(float if kind == np.float64 else np.float32)
     out = room([span.count for span in spans], mean if averaged else kind.newbyteorder("="))

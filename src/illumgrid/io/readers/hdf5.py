@@ -9,7 +9,7 @@ from illumgrid.errors import BadInput
 from illumgrid.io.readers.arrays import three_axes
 from illumgrid.io.readers.chunked import axes_of, by_name, read_box
 from illumgrid.io.readers.limits import check_axes
-from illumgrid.io.readers.source import Source
+from illumgrid.io.readers.source import Source, seekable
 from illumgrid.io.readers.stored import Note, Stored, Wanted, pick
 
 _MOST = 10_000
@@ -18,9 +18,7 @@ _MOST = 10_000
 
 def read(source: Source, wanted: Wanted) -> Stored:
     """Read the only dataset of three or more axes, or that of `--array`."""
-    if source.packed:
-        raise BadInput("an HDF5 file that is packed as a whole; expected the file itself; unpack it with gunzip")
-    with h5py.File(source.file, "r") as file:
+    with seekable(source) as stream, h5py.File(stream if source.packed else source.file, "r") as file:
         if "ITKImage" in file:
             return _by_itk(source, wanted)
         found = _datasets(file)

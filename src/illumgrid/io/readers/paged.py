@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from illumgrid.errors import BadInput
-from illumgrid.io.readers.limits import CHUNK, free_memory, gigabytes
+from illumgrid.io.readers import limits
 
 SHARE = 4
 """An array is kept in memory up to one part in so many of what is free."""
@@ -23,7 +23,7 @@ TURNED = 1 << 28
 
 def resident(size: int) -> int:
     """Bytes of memory that an array of so many takes: what is paged takes none that others could not have."""
-    return size if size <= free_memory() // SHARE else CHUNK
+    return size if size <= limits.free_memory() // SHARE else min(size, limits.CHUNK)
 
 
 def room(shape: Sequence[int], dtype: DTypeLike, order: Literal["C", "F"] = "C") -> NDArray[Any]:
@@ -35,12 +35,12 @@ def room(shape: Sequence[int], dtype: DTypeLike, order: Literal["C", "F"] = "C")
         If neither memory nor disk have room for it.
     """
     size = math.prod(map(int, shape)) * np.dtype(dtype).itemsize
-    if size == 0 or resident(size) == size:
+    if size <= limits.free_memory() // SHARE:
         return np.zeros(tuple(shape), dtype, order)
     place = gettempdir()
     if size > shutil.disk_usage(place).free:
         raise BadInput(
-            f"needs {gigabytes(size)}, of which neither the memory nor {place} have as much; expected less; set "
+            f"needs {limits.gigabytes(size)}, of which neither the memory nor {place} have as much; expected less; set "
             "TMPDIR to a larger disk, or read a part with --crop or means over voxels with --downsample"
         )
     with TemporaryFile(prefix="illumgrid-") as file:
@@ -48,7 +48,7 @@ def room(shape: Sequence[int], dtype: DTypeLike, order: Literal["C", "F"] = "C")
             os.posix_fallocate(file.fileno(), 0, size)  # a disk that fills up later would end the process
         else:
             file.truncate(size)
-        return np.asarray(np.memmap(file, dtype, "r+", shape=tuple(shape), order=order))  # type: ignore[call-overload]
+        return np.asarray(np.memmap(file, dtype, "r+", shape=tuple(shape), order=order))
 
 
 def mapped(stream: IO[bytes], dtype: DTypeLike, count: int) -> NDArray[Any] | None:
@@ -59,12 +59,12 @@ def mapped(stream: IO[bytes], dtype: DTypeLike, count: int) -> NDArray[Any] | No
     """
     kind = np.dtype(dtype)
     plain = isinstance(stream, io.BufferedReader) and isinstance(stream.raw, io.FileIO)
-    if not plain or not kind.isnative or resident(count * kind.itemsize) == count * kind.itemsize:
+    if not plain or not kind.isnative or count * kind.itemsize <= limits.free_memory() // SHARE:
         return None
     first = stream.tell()
     if first % kind.itemsize or first + count * kind.itemsize > os.fstat(stream.fileno()).st_size:
         return None
-    found = np.memmap(stream, kind, "r", first, (count,))  # type: ignore[call-overload]
+    found = np.memmap(stream, kind, "r", first, (count,))
     stream.seek(first + count * kind.itemsize)
     return np.asarray(found)
 
@@ -75,7 +75,7 @@ def settled(values: NDArray[Any]) -> NDArray[Any]:
     What fits into memory stays as it is: others turn it.
     """
     native = values.dtype.newbyteorder("=")
-    if (values.flags.c_contiguous and values.dtype.isnative) or resident(values.nbytes) == values.nbytes:
+    if (values.flags.c_contiguous and values.dtype.isnative) or values.nbytes <= limits.free_memory() // SHARE:
         return values
     out = room(values.shape, native)
     slow = int(np.argmax([abs(step) for step in values.strides]))
