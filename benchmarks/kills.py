@@ -255,6 +255,8 @@ def main():
             except (AssertionError, OSError, ValueError) as trouble:
                 found, wrong = f"WRONG: {type(trouble).__name__} {trouble}", wrong + 1
                 print(f"{number} {at} {signals.name}: {found}", flush=True)
+            if found.startswith("ended"):  # the machine is quicker than when the command was timed
+                known[at].before, known[at].during = 0.7 * known[at].before, 0.7 * known[at].during
             tally[f"{signals.name}: {found}"] += 1
             shutil.rmtree(folder)
             if number % 10 == 9:
