@@ -154,13 +154,37 @@ def flip(made, steps):
     }
 
 
+def chart(rows, file):
+    """Error against seconds of all processors, a panel for each scene."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(1, len(rows), figsize=(3.4 * len(rows), 3.1), sharey=True, layout="constrained")
+    for ax, row in zip(np.atleast_1d(axes), rows):
+        for kind, color, mark in (("resting", "#0072b2", "o"), ("path tracing", "#d55e00", "s")):
+            x, y = zip(*((step["seconds"], 100 * step["error"][0]) for step in row[kind]))
+            ax.plot(x, y, color=color, marker=mark, ms=4, label=f"{kind} picture" if kind == "resting" else kind)
+        ax.axhline(100 * row["lookup"]["error"][0], color="0.4", ls="--", label="lookup")
+        ax.axhline(10 * row["lookup"]["error"][0], color="0.7", ls=":", label="a tenth of it")
+        ax.set(xscale="log", yscale="log", title=row["scene"], xlabel="processor seconds at 640 x 480")
+    np.atleast_1d(axes)[0].set_ylabel("relative RMSE, %")
+    np.atleast_1d(axes)[0].legend(fontsize=8)
+    figure.savefig(file, dpi=110)
+
+
 def main():
     parser = argparse.ArgumentParser()
     parser.add_argument("--volumes", type=Path, default=VOLUMES)
     parser.add_argument("--only")
     parser.add_argument("--paths", type=int, default=1024)
     parser.add_argument("--out", type=Path, default=Path("exact.json"))
+    parser.add_argument("--chart", nargs="+", type=Path, metavar="JSON", help="draw what was measured; PNG last")
     given = parser.parse_args()
+    if given.chart:
+        chart([row for file in given.chart[:-1] for row in json.loads(file.read_text())], given.chart[-1])
+        return
     rows = []
     for name, scene, grid in scenes(given.volumes):
         if given.only in (None, name):
