@@ -14,7 +14,7 @@ from illumgrid.accuracy.chart.contestants import Method
 from illumgrid.accuracy.chart.race import Run
 from illumgrid.backends.numba_ import Numba
 from illumgrid.bake.accumulator import Bake
-from illumgrid.bake.targets import wall_queries
+from illumgrid.bake.walls import wall_queries
 from illumgrid.field.scene import Scene, level_table
 from illumgrid.grid import GridSpec
 from illumgrid.interpolators.nearest import Nearest

@@ -9,7 +9,7 @@ import pytest
 import naive
 from illumgrid.backends.numba_ import Numba
 from illumgrid.backends.reference import Reference
-from illumgrid.bake.targets import wall_queries
+from illumgrid.bake.walls import wall_queries
 from illumgrid.field.scene import Field, Material, Scene, box_around, level_table
 from illumgrid.field.volume import interpolate, world_to_index
 from illumgrid.transport.samples import join_queries

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from illumgrid.accuracy import points
 from illumgrid.accuracy.points import unseen_in_volume
 from illumgrid.field import boundaries, bricks, diagnosis
 from illumgrid.field.boundaries import suggest_range
@@ -14,6 +13,7 @@ from illumgrid.field.lattice import nodes_over
 from illumgrid.field.scene import Field
 from illumgrid.field.volume import Volume, histogram, interpolate, slabs, world_to_index
 from illumgrid.grid.nodes import reachable
+from illumgrid.samplers import coarea
 from illumgrid.show.camera import outline_of
 from illumgrid.show.viewer.arrays import field_steps
 from shapes import ball, sky
@@ -79,7 +79,7 @@ def test_cubes_suggest_nearly_the_range_of_the_whole(monkeypatch, inside):
 
 def test_points_in_some_columns_are_even_over_the_range(monkeypatch):
     scene = sky(ball(30))
-    monkeypatch.setattr(points, "_LOOKED_AT", 6000)  # of 27000 voxels
+    monkeypatch.setattr(coarea, "_LOOKED_AT", 6000)  # of 27000 voxels
     asked = unseen_in_volume(scene, 2000, seed=0)
     volume = scene.fields[0].volume
     place = scene.fields[0].place(interpolate(volume, world_to_index(volume, asked.point)))

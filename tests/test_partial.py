@@ -206,7 +206,8 @@ def test_two_processes_do_not_work_on_one_partial_run(call, pieces):
 
 def test_every_fourth_node_comes_first(call, pieces):
     """Ranks of nodes and texels: 0 for every fourth along each axis, 1 for every second, 2 for the others."""
-    from illumgrid.bake.targets import coarse_first, wall_queries
+    from illumgrid.bake.targets import coarse_first
+    from illumgrid.bake.walls import wall_queries
 
     scene = ig.Scene.floor(ball(10), range=(0.3, 0.9))
     specs, levels = specs_over(scene, 9), level_table(scene, 5)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from illumgrid.backends.numba_ import Numba
-from illumgrid.bake.targets import wall_queries
+from illumgrid.bake.walls import wall_queries
 from illumgrid.field.levelset import isosurface
 from illumgrid.field.scene import Field, Levels, Material, Scene, box_around
 from illumgrid.field.volume import cell_gradient, world_to_index

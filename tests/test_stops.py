@@ -14,7 +14,7 @@ from illumgrid import cli
 from illumgrid.backends.mesh import bvh
 from illumgrid.backends.numba_ import Numba
 from illumgrid.bake.accumulator import Bake
-from illumgrid.bake.targets import wall_queries
+from illumgrid.bake.walls import wall_queries
 from illumgrid.field import cubes
 from illumgrid.field.levelset import isosurface
 from illumgrid.field.scene import Scene, level_table

@@ -9,7 +9,7 @@ import pytest
 import illumgrid as ig
 from illumgrid.backends.numba_ import Numba
 from illumgrid.bake import bake
-from illumgrid.bake.targets import texel_paths, wall_queries
+from illumgrid.bake.walls import texel_paths, wall_queries
 from illumgrid.errors import BadInput
 from illumgrid.field.scene import Field, Material, Quad, Scene, level_table
 from illumgrid.grid import GridSpec, WallTexture

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from illumgrid import registry
-from illumgrid.bake import wall_texture
-from illumgrid.bake.targets import coarse_first, held_queries, node_queries, of_field, wall_queries
+from illumgrid.bake.targets import coarse_first, held_queries, node_queries, of_field
+from illumgrid.bake.walls import wall_queries, wall_texture
 from illumgrid.errors import BadInput
 from illumgrid.field.lattice import specs_over
 from illumgrid.field.scene import level_table

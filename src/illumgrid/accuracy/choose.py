@@ -8,7 +8,7 @@ import numpy as np
 
 from illumgrid.accuracy.cost import Pace, measure_pace
 from illumgrid.accuracy.probe import FEWEST_PATHS, MOST_PATHS, Measured, Probe
-from illumgrid.bake.targets import texel_paths, wall_queries
+from illumgrid.bake.walls import texel_paths, wall_queries
 from illumgrid.field.lattice import specs_over
 from illumgrid.field.scene import Levels, Scene
 from illumgrid.rng import shifted_seed

@@ -1,14 +1,9 @@
 """The error of the light of walls: at places on them and in the sweep at which no texel and no row of the table is."""
 
-from collections.abc import Sequence
-
 import numpy as np
-from numpy.typing import NDArray
 
 from illumgrid.accuracy.points import other_paths
 from illumgrid.field.scene import Scene
-from illumgrid.field.volume import Floats
-from illumgrid.grid import WallTexture
 from illumgrid.transport.samples import Queries
 
 
@@ -33,24 +28,3 @@ def unseen_on_walls(scene: Scene, points: int, seed: int) -> Queries:
         level=scene.levels(t),
         target=target,
     )
-
-
-def place_on_walls(scene: Scene, asked: Queries) -> tuple[NDArray[np.intp], Floats, Floats, Floats]:
-    """For queries on walls (n,): the number of the quad, u and v along its edges, and t in the sweep."""
-    number = asked.target.astype(int) - len(scene.fields)
-    uv = np.zeros((len(asked), 2))
-    for k in np.unique(number):
-        quad, own = scene.quads[k], number == k
-        edges = np.stack([quad.edge_u, quad.edge_v], axis=1)
-        uv[own] = np.linalg.lstsq(edges, (asked.point[own] - quad.corner).T, rcond=None)[0].T
-    return number, uv[:, 0], uv[:, 1], scene.fields[0].place(asked.level[:, 0])
-
-
-def look_up_walls(scene: Scene, walls: Sequence[WallTexture], asked: Queries) -> Floats:
-    """Light (n, 3) that the textures hold at queries on walls."""
-    number, u, v, t = place_on_walls(scene, asked)
-    light = np.zeros((len(asked), 3))
-    for k in np.unique(number):
-        own = number == k
-        light[own] = walls[k].lookup(u[own], v[own], t[own])
-    return light

@@ -13,16 +13,13 @@ from illumgrid.bake.targets import (
     held_queries,
     node_queries,
     of_field,
-    texel_paths,
-    wall_queries,
 )
-from illumgrid.field.scene import Levels, Quad, Scene
+from illumgrid.bake.walls import texel_paths, wall_queries, wall_texture
+from illumgrid.field.scene import Levels, Scene
 from illumgrid.field.volume import interpolate, world_to_index
-from illumgrid.grid import GridSpec, IlluminationGrid, Nodes, WallTexture, fill_holes
+from illumgrid.grid import GridSpec, IlluminationGrid, Nodes, WallTexture
 from illumgrid.grid.nodes import reachable
-from illumgrid.grid.walls import calmed
 from illumgrid.stages import Interpolator, Sampler
-from illumgrid.transport.samples import Samples
 from illumgrid.transport.stages import fill_nodes
 from illumgrid.transport.tracer import Tracer
 from illumgrid.transport.walk import Keeper, in_order
@@ -44,7 +41,7 @@ class Baked:
         Number of queries answered, texels among them.
     paths : int
         Paths walked from each of a field's.
-    texels, texel_paths : int
+    texels : int
         Queries on walls, and paths walked from each.
     holes : tuple of int
         For each field, nodes that its isosurfaces can show and no sample supports.
@@ -58,21 +55,6 @@ class Baked:
     texels: int
     texel_paths: int
     holes: tuple[int, ...]
-
-
-def wall_texture(rows: int, quad: Quad, answer: Samples) -> WallTexture:
-    """The texture of a quad from the samples at its texels, for so many rows of levels; its noise is calmed."""
-    nu, nv = quad.texels
-    support = (answer.paths > 0).astype(np.float32).reshape(rows, nv, nu)
-    texel = np.linalg.norm(quad.edge_v) / nv, np.linalg.norm(quad.edge_u) / nu
-    # Another row is another setting of the sweep: look there last.
-    spacing = (1e3 * max(texel) * max(nu, nv), *texel)
-    shape = rows, nv, nu
-    calm = calmed(
-        answer.light.reshape(*shape, -1), answer.mean.reshape(*shape, 3), answer.error.reshape(shape), support
-    )
-    light = fill_holes(spacing, calm, support)
-    return WallTexture(light, support, answer.channels)
 
 
 def holes_within_range(scene: Scene, field: int, grid: IlluminationGrid) -> int:

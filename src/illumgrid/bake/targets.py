@@ -25,25 +25,6 @@ def node_queries(scene: Scene, specs: Sequence[GridSpec], sampler: Sampler, seed
     return [batch for batch in batches if len(batch)]
 
 
-def wall_queries(scene: Scene, levels: Levels) -> list[Queries]:
-    """Queries at the middles of the texels of every quad's front, for every row of levels: one batch a quad."""
-    batches = []
-    for number, quad in enumerate(scene.quads, len(scene.fields)):
-        nu, nv = quad.texels
-        rows, v, u = np.indices((len(levels.table), nv, nu)).reshape(3, -1)
-        point = quad.corner + ((u + 0.5) / nu)[:, None] * quad.edge_u + ((v + 0.5) / nv)[:, None] * quad.edge_v
-        batches.append(
-            Queries(
-                id=np.arange(len(rows), dtype=np.uint64) | np.uint64(number << 40),
-                point=point,
-                normal=np.tile(quad.normal, (len(rows), 1)),
-                level=levels.table[rows],
-                target=np.full(len(rows), number, np.int32),
-            )
-        )
-    return batches
-
-
 def held_queries(scene: Scene, nodes: Sequence[Queries]) -> list[Queries]:
     """Queries at the nodes of each field whose level is held, with the others at `HELD_ROWS` places of the sweep.
 
@@ -82,14 +63,6 @@ def coarse_first(scene: Scene, specs: Sequence[GridSpec], levels: Levels, querie
 def _rank(index: Sequence[NDArray[np.integer]] | NDArray[np.integer]) -> NDArray[np.int8]:
     even, fourth = (np.logical_and.reduce([axis % step == 0 for axis in index]).astype(np.int8) for step in (2, 4))
     return np.asarray(2 - even - fourth, np.int8)
-
-
-def texel_paths(nodes: int, texels: int) -> int:
-    """Paths from a texel for each from a node: up to eight, while the walls are no more work than the grids.
-
-    A texel is seen across many pixels, where noise that a curved surface hides shows as blotches.
-    """
-    return int(np.clip(nodes // max(texels, 1), 1, 8))
 
 
 def of_field(scene: Scene, answers: Sequence[Samples], number: int) -> Samples:

@@ -1,0 +1,82 @@
+"""Points that are uniform by area on level sets, each on one of its own: no surface is extracted."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from illumgrid.field.scene import Field, Scene
+from illumgrid.field.volume import AT_ONCE, Floats, cell_gradient, index_to_world, interpolate
+from illumgrid.transport.samples import Queries, join_queries
+
+_LOOKED_AT = 1 << 24  # voxels of a field of which all are looked at
+_STEPS = 64  # of the isovalue, within which points are uniform by area
+
+
+def points_on_level_sets(scene: Scene, points: int, seed: tuple[int, ...]) -> Queries:
+    """About `points` for each field, as many from each of 64 equal steps of its range.
+
+    By the co-area formula, points of a volume weighted by |∇h| are uniform by area on the level sets through them;
+    weights that add up to the same within each step make them uniform in the isovalue.
+    """
+    found = []
+    for number, field in enumerate(scene.fields):
+        random = np.random.default_rng((*seed, number))
+        cells, chance = _cells_by_step(field, random)
+        if not len(cells):
+            continue
+        upto = np.cumsum(chance)
+        tried = np.searchsorted(upto, random.random(max(1 << 15, 64 * points)) * upto[-1]).clip(0, len(cells) - 1)
+        shape = tuple(n - 1 for n in field.volume.shape)
+        index = np.stack(np.unravel_index(cells[tried], shape), axis=1) + random.random((len(tried), 3))
+        share = field.place(interpolate(field.volume, index))
+        kept = (share >= 0) & (share <= 1)
+        index, step = index[kept], np.minimum(share[kept] * _STEPS, _STEPS - 1).astype(int)
+        weight = np.linalg.norm(cell_gradient(field.volume, index), axis=1) / chance[tried[kept]]
+        total = np.bincount(step, weight, minlength=_STEPS)
+        weight = weight / np.where(total > 0, total, 1.0)[step]
+        if weight.any():
+            # Systematic draws from the points in order of isovalue: the same number from every step, or nearly.
+            order = np.argsort(step, kind="stable")
+            mass = np.cumsum(weight[order]) / weight.sum()
+            chosen = order[np.searchsorted(mass, (np.arange(points) + random.random()) / points).clip(0, len(mass) - 1)]
+            world = index_to_world(field.volume, index[np.unique(chosen)])
+            found.append(Queries.at(scene, world, field=number, first_id=number << 40))
+    if not found:
+        return Queries.at(scene, np.zeros((0, 3)))
+    asked = join_queries(found)
+    return asked[np.flatnonzero(asked.normal.any(axis=1))]
+
+
+def _cells_by_step(field: Field, random: np.random.Generator) -> tuple[NDArray[np.int64], Floats]:
+    """Flat numbers (n,) of the voxel cells that the range crosses, and chances (n,) that give every step as many.
+
+    Chosen all alike, the few cells around a small level set would hardly be met. Of a volume of more than `_LOOKED_AT`
+    voxels only some columns of cells are looked at.
+    """
+    nx, ny, nz = field.volume.shape
+    many, at_once = (nx - 1) * (ny - 1), max(1, AT_ONCE // (4 * nz))
+    columns = np.arange(many)
+    if field.volume.stored.size > _LOOKED_AT:
+        columns = np.sort(random.choice(many, _LOOKED_AT // nz, replace=False))
+    parts = [_crossed(field, columns[first : first + at_once]) for first in range(0, len(columns), at_once)]
+    cells, first, last = (np.concatenate(each) for each in zip(*parts))
+    many_in = np.cumsum(np.bincount(first, minlength=_STEPS + 1) - np.bincount(last, minlength=_STEPS + 1))
+    rare = np.concatenate([[0.0], np.cumsum(1.0 / np.maximum(many_in, 1))])
+    return cells, rare[last] - rare[first]
+
+
+def _crossed(
+    field: Field, columns: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """Of the cells in some columns along the last axis, those that the range crosses: number, first step, last + 1."""
+    (lowest, highest), (_, ny, nz) = map(float, field.stored_range), field.volume.shape
+    x, y = np.divmod(columns, ny - 1)
+    steps = []
+    for corner in np.ndindex(2, 2):
+        share = field.volume.stored[x + corner[0], y + corner[1]].astype(np.float32, copy=False) - lowest
+        share *= _STEPS / (highest - lowest)
+        steps.append(np.clip(np.floor(share, out=share), -1, _STEPS, out=share).astype(np.int8))
+    low, high = (of.reduce(steps) for of in (np.minimum, np.maximum))
+    first = np.maximum(np.minimum(low[:, :-1], low[:, 1:]), 0)
+    last = np.minimum(np.maximum(high[:, :-1], high[:, 1:]), _STEPS - 1)
+    row, z = np.nonzero(first <= last)
+    return columns[row] * (nz - 1) + z, first[row, z].astype(int), last[row, z].astype(int) + 1
