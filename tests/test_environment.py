@@ -32,6 +32,16 @@ def test_info_of_a_name_of_other_bytes_in_other_encodings(odd, encoding):
     assert (b"#" in line or b"*" in line or b"@" in line) == (encoding != "utf-8")
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows keeps the folder that a process works in")
+@pytest.mark.parametrize("command", [["info", "v.npy"], ["run", "-o", "out"], ["view", "out"], ["verify"]])
+def test_a_working_folder_that_is_gone_is_named(tmp_path, command):
+    (tmp_path / "gone").mkdir()
+    run = ["sh", "-c", 'rmdir ../gone && exec "$@"', "sh", sys.executable, "-m", "illumgrid", *command]
+    done = subprocess.run(run, capture_output=True, text=True, cwd=tmp_path / "gone")
+    assert done.returncode == 2 and done.stderr.count("\n") == 1
+    assert done.stderr.startswith("illumgrid: the working folder is gone")
+
+
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="elsewhere names are texts")
 def test_names_of_other_bytes_are_read_and_shown(odd, tmp_path):
     assert read_volume(odd).shape == (6, 6, 6)

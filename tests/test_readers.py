@@ -57,6 +57,18 @@ def test_round_trip(tmp_path, ending, dtype, how):
     assert np.allclose(volume.spacing, SPACING, rtol=1e-6) and np.allclose(volume.origin, ORIGIN)
 
 
+@pytest.mark.filterwarnings("ignore:spacing")
+@pytest.mark.parametrize("ending", ["nrrd", "nii", "mha", "mrc", "vtk", "tif", "npy", "nii.gz", "mha.gz"])
+def test_endings_may_be_in_capitals(tmp_path, ending):
+    if ending == "npy":
+        np.save(tmp_path / "a.npy", values("int16"))
+    else:
+        write(tmp_path / f"a.{ending.removesuffix('.gz')}", values("int16"))
+    file = zipped(tmp_path / f"a.{ending[:-3]}") if ending.endswith(".gz") else tmp_path / f"a.{ending}"
+    loud = file.rename(tmp_path / f"SCAN.{ending.upper()}")
+    assert np.array_equal(read_volume(loud).values, values("int16")) and volume_name(loud) == "SCAN"
+
+
 DTYPES = ["?", "i1", "<i2", ">i2", "u4", ">i8", "u8", "<f2", ">f2", ">f4", "<f4", ">f8", "<f8", "g"]
 
 

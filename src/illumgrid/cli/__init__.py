@@ -51,6 +51,12 @@ def root(
     ] = False,
 ) -> None:
     """Global illumination for every isosurface of a volume at once."""
+    try:
+        os.getcwd()
+    except OSError:
+        raise BadInput(
+            "the working folder is gone: deleted, moved or unmounted; expected one that is there; cd to it"
+        ) from None
 
 
 def main() -> None:
