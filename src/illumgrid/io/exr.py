@@ -1,4 +1,4 @@
-"""Arrays as the parts of one OpenEXR file: scan lines, ZIP; written without a copy of what is large.
+"""Arrays as the parts of one OpenEXR file: scan lines, ZIP; written some rows at a time, read by the library.
 
 An array of light (nx, ny, nz) is an image nx wide and ny*nz high, float32. A field keeps its order, row = x*ny + y
 and column = z: float32 as channel Y, other types as the bytes of each row, padded to whole words of 32 bits, in the
@@ -7,6 +7,7 @@ channel ``bytes``.
 
 import os
 import struct
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from math import prod
 from pathlib import Path
@@ -17,6 +18,7 @@ import OpenEXR
 from numpy.typing import NDArray
 
 from illumgrid.errors import BadInput
+from illumgrid.io import scanlines
 
 LAYOUT = "array (nx, ny, nz) = ({}, {}, {}); row = z*ny + y, column = x"
 FIELD = "array (nx, ny, nz) = ({}, {}, {}) of {}; row = x*ny + y, column = z"
@@ -24,7 +26,8 @@ BYTES = "bytes"
 DEFLATE_AT_MOST = 1032  # bytes out for one byte in: a file that claims more is refused before memory is asked for
 _WORD = 4  # bytes of a pixel
 _MULTIPART = 1 << 12  # in the version of a file
-_LINES = 16  # rows that ZIP packs together
+_LINES = scanlines.LINES
+_AT_ONCE = 1 << 22  # bytes that are written together, or so
 
 Image = NDArray[Any]
 Parts = dict[str, dict[str, Image]]
@@ -51,16 +54,43 @@ class Planned:
         return FIELD.format(*self.shape, self.kind) if self.field else LAYOUT.format(*self.shape)
 
 
-def of_field(values: NDArray[Any]) -> tuple[Planned, dict[str, Image]]:
-    """The part of a field's values, which are not copied where its rows are whole words."""
+@dataclass(frozen=True, eq=False)
+class Words:
+    """The rows of a field as whole words; slices of it are images, made when they are asked for."""
+
+    values: NDArray[Any]
+    dtype = np.dtype(np.uint32)
+
+    def __getitem__(self, rows: slice) -> Image:
+        some = self.values.reshape(-1, self.values.shape[2])[rows]
+        spare = -some.shape[1] % (_WORD // some.itemsize)
+        return np.ascontiguousarray(np.pad(some, [(0, 0), (0, spare)]) if spare else some).view(np.uint32)
+
+
+@dataclass(frozen=True, eq=False)
+class Turned:
+    """An array (nx, ny, nz) as an image nx wide; slices of it are images, made when they are asked for."""
+
+    array: NDArray[np.float32]
+    dtype = np.dtype(np.float32)
+
+    def __getitem__(self, rows: slice) -> Image:
+        nx, ny, _ = self.array.shape
+        first, last = rows.start // ny, -(-rows.stop // ny)
+        planes = np.ascontiguousarray(self.array[:, :, first:last].swapaxes(0, 2)).reshape(-1, nx)
+        return planes[rows.start - first * ny : rows.stop - first * ny]
+
+
+Rows = Words | Turned | Image
+
+
+def of_field(values: NDArray[Any]) -> tuple[Planned, dict[str, Rows]]:
+    """The part of a field's values, which are not copied."""
     nx, ny, nz = values.shape
     kind = values.dtype.name
     if values.dtype == np.float32:
         return Planned((nx, ny, nz), ("Y",), kind, field=True), {"Y": values.reshape(nx * ny, nz)}
-    spare = -nz % (_WORD // values.itemsize)
-    rows = np.pad(values, [(0, 0), (0, 0), (0, spare)]) if spare else values
-    words = rows.reshape(nx * ny, nz + spare).view(np.uint32)
-    return Planned((nx, ny, nz), (BYTES,), kind, field=True), {BYTES: words}
+    return Planned((nx, ny, nz), (BYTES,), kind, field=True), {BYTES: Words(values)}
 
 
 def field_values(part: dict[str, Image], plan: Planned) -> NDArray[Any]:
@@ -70,30 +100,35 @@ def field_values(part: dict[str, Image], plan: Planned) -> NDArray[Any]:
     return image.view(plan.kind).reshape(nx, ny, -1)[:, :, :nz]
 
 
-def image(array: NDArray[np.float32]) -> Image:
-    """Lay out an array (nx, ny, nz) as an image (nz*ny, nx)."""
-    nx, ny, nz = array.shape
-    return np.ascontiguousarray(array.swapaxes(0, 2)).reshape(nz * ny, nx)
-
-
 def array(part: dict[str, Image], names: str | tuple[str, ...], shape: tuple[int, int, int]) -> NDArray[np.float32]:
-    """Undo `image`: one channel as (nx, ny, nz), without a copy; several as (nx, ny, nz, C)."""
+    """Undo `Turned`: one channel as (nx, ny, nz), without a copy; several as (nx, ny, nz, C)."""
     if isinstance(names, str):
         return part[names].reshape(shape[::-1]).swapaxes(0, 2)
     return np.stack([array(part, name, shape) for name in names], axis=-1)
 
 
-def write(path: Path, parts: dict[str, tuple[Planned, dict[str, Image]]]) -> None:
+def write(path: Path, parts: dict[str, tuple[Planned, Mapping[str, Rows]]]) -> None:
     """Write images by part and channel."""
     sizes = [planned.size for planned, _ in parts.values()]
-    window = ((0, 0), (max(w for w, _ in sizes) - 1, max(h for _, h in sizes) - 1))  # all parts must share it
-    common = {"type": OpenEXR.scanlineimage, "compression": OpenEXR.ZIP_COMPRESSION, "displayWindow": window}
-    OpenEXR.File(
+    window = max(w for w, _ in sizes), max(h for _, h in sizes)  # all parts must share it
+    scanlines.write(
+        path,
         [
-            OpenEXR.Part(common | {"layout": planned.layout}, channels, name)
-            for name, (planned, channels) in parts.items()
-        ]
-    ).write(os.fsencode(path))
+            scanlines.Part(
+                planned.size, {channel: rows.dtype for channel, rows in images.items()}, _some(planned.size, images),
+                {"layout": planned.layout}, name, window,
+            )
+            for name, (planned, images) in parts.items()
+        ],
+    )  # fmt: skip
+
+
+def _some(size: tuple[int, int], images: Mapping[str, Rows]) -> Iterator[list[Image]]:
+    """Rows of all channels, some at a time."""
+    width, height = size
+    many = max(1, _AT_ONCE // (_WORD * width * len(images) * _LINES)) * _LINES
+    for first in range(0, height, many):
+        yield [one[slice(first, min(first + many, height))] for one in images.values()]
 
 
 def read(path: Path, plan: dict[str, Planned]) -> Parts:

@@ -21,8 +21,6 @@ TO_DESCRIBE = 21
 """Bytes a voxel for the histogram, plateaus and warnings of a volume that is read; of a large one, see `of_field`."""
 TO_LIGHT = 44
 """Bytes a voxel for diagnosis, preparation and writing of a field; of a large one, see `of_field`."""
-TO_EXPORT = 24
-"""Bytes a point for the arrays of a .exr file; the other formats are written a part at a time."""
 _PARTS, _BRICKS = 1 << 24, 3
 """Voxels of a field of which all are looked at together; bytes for each further one, those of its bricks."""
 TO_DEPOSIT = 18

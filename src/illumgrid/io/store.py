@@ -429,13 +429,13 @@ def _write_exr(path: Path, stored: Stored) -> None:
     def split(of: IlluminationGrid | WallTexture) -> dict[str, Any]:
         return {name: of.light[..., c] for c, name in enumerate(of.channels.names)}
 
-    def images(arrays: dict[str, Any]) -> tuple[exr.Planned, dict[str, exr.Image]]:
+    def images(arrays: dict[str, Any]) -> tuple[exr.Planned, dict[str, exr.Rows]]:
         shape = next(iter(arrays.values())).shape
-        return exr.Planned(shape, tuple(arrays)), {name: exr.image(array) for name, array in arrays.items()}
+        return exr.Planned(shape, tuple(arrays)), {name: exr.Turned(array) for name, array in arrays.items()}
 
-    parts: dict[str, tuple[exr.Planned, dict[str, exr.Image]]] = {}
+    parts: dict[str, tuple[exr.Planned, dict[str, exr.Rows]]] = {}
 
-    def of_grid(grid: IlluminationGrid) -> tuple[exr.Planned, dict[str, exr.Image]]:
+    def of_grid(grid: IlluminationGrid) -> tuple[exr.Planned, dict[str, exr.Rows]]:
         arrays = split(grid) | {"error": grid.error, "support": grid.support}
         if names := _errors(grid.channels):
             errors = np.full(grid.light.shape, np.inf, np.float32) if grid.errors is None else grid.errors

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, cast
 
 from illumgrid.errors import BadInput, shown
 from illumgrid.field.volume import Volume
-from illumgrid.io import disk, needs
+from illumgrid.io import disk
 from illumgrid.io.exports import arrays, surface, vti
 from illumgrid.io.readers.mesh import read_mesh
 
@@ -128,10 +128,6 @@ def write(
         level = shown(cast(float, lit.isovalue), light.scene.fields[number].range, 6)
         return f"isosurface {level} of {lit.field!r}, {count} triangles, exposure {lit.exposure:.4g}"
     names = (array or "irradiance",) if ending == ".nrrd" else arrays.NAMES
-    lattice = light.grids[number].spec if on != "field" else light.scene.fields[number].volume
-    if ending == ".exr":
-        todo = "leave out --on field, or write a .vti, which is written a part at a time"
-        needs.check("the file", needs.TO_EXPORT * math.prod(lattice.shape), todo)
     points = arrays.points_of(light, number, on or "grid", names)
     with disk.fresh_file(path) as fresh:
         LATTICES[ending](fresh, points, progress)

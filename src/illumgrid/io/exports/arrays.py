@@ -160,31 +160,32 @@ def _vector(numbers: Floats) -> str:
 
 def write_exr(path: Path, points: Points, progress: "Progress") -> None:
     """Write an image nx wide and ny·nz high, float32: R, G, B (irradiance), error, support, field."""
-    import OpenEXR
-
+    from illumgrid.io import scanlines
     from illumgrid.io.exr import LAYOUT, check_end
 
     if points.kinds["field"] == np.float64:
         raise BadInput("the field's values need double precision, which .exr lacks; expected .vti, .nrrd or .npz")
     nx, ny, nz = points.lattice.shape
-    progress("file", 0, 1)
-    header = {
-        "type": OpenEXR.scanlineimage, "compression": OpenEXR.ZIP_COMPRESSION, "layout": LAYOUT.format(nx, ny, nz),
-        "origin": points.lattice.origin, "spacing": points.lattice.spacing, "direction": points.lattice.direction,
-        "exposure": points.exposure,
+    about = {
+        "layout": LAYOUT.format(nx, ny, nz), "origin": points.lattice.origin, "spacing": points.lattice.spacing,
+        "direction": points.lattice.direction, "exposure": points.exposure,
     }  # fmt: skip
-    channels, first = {}, 0
     shown = [name for name in points.kinds if name != "color"]  # an EXR viewer makes its own
-    for name in shown:
-        several = (3,) if points.components(name) == 3 else ()
-        channels["RGB" if name == "irradiance" else name] = np.empty((nz * ny, nx, *several), np.float32)
-    for part in points.parts(shown, True, progress):
-        for array, image in zip(part.values(), channels.values()):
-            image.reshape(-1, *array.shape[1:])[first : first + len(array)] = array
-        first += len(array)
-    OpenEXR.File(header, channels).write(str(path))
+    channels = {c: np.float32 for name in shown for c in ("RGB" if name == "irradiance" else [name])}
+    rows = _whole_rows(points.parts(shown, True, progress), nx)
+    scanlines.write(path, [scanlines.Part((nx, nz * ny), channels, rows, about)])
     check_end(path, nz * ny)
-    progress("file", 1, 1)
+
+
+def _whole_rows(parts: Iterator[Arrays], width: int) -> Iterator[list[NDArray[Any]]]:
+    """Each component of arrays that come in parts as rows (m, width)."""
+    rest: list[NDArray[Any]] = []
+    for part in parts:
+        columns = [c for array in part.values() for c in (array.T if array.ndim == 2 else [array])]
+        rest = [np.concatenate(pair) for pair in zip(rest, columns)] if rest else columns
+        many = len(rest[0]) // width * width
+        yield [column[:many].reshape(-1, width) for column in rest]
+        rest = [column[many:] for column in rest]
 
 
 def write_npz(path: Path, points: Points, progress: "Progress") -> None:
