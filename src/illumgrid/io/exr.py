@@ -107,7 +107,7 @@ def array(part: dict[str, Image], names: str | tuple[str, ...], shape: tuple[int
     return np.stack([array(part, name, shape) for name in names], axis=-1)
 
 
-def write(path: Path, parts: dict[str, tuple[Planned, Mapping[str, Rows]]]) -> None:
+def write(path: Path, parts: Mapping[str, tuple[Planned, Mapping[str, Rows]]]) -> None:
     """Write images by part and channel."""
     sizes = [planned.size for planned, _ in parts.values()]
     window = max(w for w, _ in sizes), max(h for _, h in sizes)  # all parts must share it
