@@ -119,6 +119,20 @@ def test_a_folder_of_slices(tmp_path):
     refused(tmp_path, "s11.tif is no single grey slice")
 
 
+@pytest.mark.filterwarnings("ignore:spacing")
+def test_a_part_of_a_folder_of_slices(tmp_path):
+    for k in range(7):
+        tifffile.imwrite(tmp_path / f"s{k}.tif", ZYX[k], photometric="minisblack")
+    (tmp_path / "s6.tif").write_bytes((tmp_path / "s6.tif").read_bytes()[:-40])  # is not opened
+    crop = (1, 5, 0, 5, 2, 6)
+    part = read_volume(tmp_path, crop=crop)
+    assert np.array_equal(part.values, values()[1:5, :5, 2:6]) and part.origin.tolist() == [1, 0, 2]
+    half = read_volume(tmp_path, crop=crop, downsample=2)
+    blocks = values()[1:5, :4, 2:6].reshape(2, 2, 2, 2, 2, 2)
+    assert np.allclose(half.values, blocks.mean(axis=(1, 3, 5)), rtol=1e-6) and half.origin.tolist() == [1.5, 0.5, 2.5]
+    refused(tmp_path, "s6.tif")
+
+
 CODECS = ["lzw", "deflate", "packbits", "zstd", "lzma"]
 
 

@@ -70,31 +70,42 @@ def _part(series: Any, spans: Sequence[Span]) -> NDArray[Any]:
 
 
 def read_folder(files: Sequence[Path], wanted: Wanted) -> Stored:
-    """Stack single TIFF slices, in the order of the numbers in their names."""
+    """Stack single TIFF slices, in the order of the numbers in their names; those outside a crop are not opened."""
     ordered = sorted(files, key=lambda f: [(int(w), "") if w.isdecimal() else (-1, w) for w in _parts(f.name)])
-    slices: list[NDArray[Any]] = []
-    for file in ordered:
-        source = find_source(file)
-        try:
-            with _opened_tiff(source) as (tiff, reports):
-                series = tiff.series[0]
-                _refuse_damaged(reports)
-                if len(tiff.series) > 1 or series.ndim != 2:
-                    raise BadInput("is no single grey slice; expected only those; give it alone if it is a stack")
-                if not slices:
-                    spacing, unit, notes = calibrated(tiff, 0)
-                    check_memory(len(ordered) * series.nbytes)
-                elif (series.shape, series.dtype) != (slices[0].shape, slices[0].dtype):
-                    raise BadInput(
-                        "differs in size or type from the first slice; expected equal slices; move it elsewhere"
-                    )
-                check_pages(tiff, series)
-                slices.append(real(series.asarray(maxworkers=1)))
-        except BadInput as problem:
-            raise BadInput(f"its slice {file.name} {problem}") from None
-    if len(slices) < 2:
+    with _slice(ordered[0]) as (tiff, series):
+        (rows, columns), dtype = series.shape, series.dtype
+        spacing, unit, notes = calibrated(tiff, 0)
+    if len(ordered) < 2:
         raise BadInput("holds one TIFF slice; expected at least 2; give the folder of the whole stack")
-    return Stored(np.stack(slices).T, np.zeros(3), np.diag(spacing), unit=unit, notes=(*notes, *_gaps(ordered)))
+    whole = (columns, rows, len(ordered))
+    check_axes(whole)
+    across, down, along = spans = wanted.spans(whole)
+    each = dtype.itemsize if along.block == 1 else 12
+    check_memory(math.prod(span.count for span in spans) * each + 3 * rows * columns * dtype.itemsize)
+
+    def plane(number: int) -> NDArray[Any]:
+        with _slice(ordered[number]) as (tiff, series):
+            if (series.shape, series.dtype) != ((rows, columns), dtype):
+                raise BadInput("differs in size or type from the first slice; expected equal slices; move it elsewhere")
+            check_pages(tiff, series)
+            return take(real(series.asarray(maxworkers=1)), (down, across))
+
+    values, notes = join(plane, along).transpose(1, 0, 2), (*notes, *_gaps(ordered))
+    return Stored(values, np.zeros(3), np.diag(spacing), unit=unit, notes=notes, whole=whole)
+
+
+@contextmanager
+def _slice(file: Path) -> Iterator[tuple[Any, Any]]:
+    """A file of a folder and its only series, a grey slice."""
+    try:
+        with _opened_tiff(find_source(file)) as (tiff, reports):
+            series = tiff.series[0]
+            _refuse_damaged(reports)
+            if len(tiff.series) > 1 or series.ndim != 2:
+                raise BadInput("is no single grey slice; expected only those; give it alone if it is a stack")
+            yield tiff, series
+    except BadInput as problem:
+        raise BadInput(f"its slice {file.name} {problem}") from None
 
 
 def _parts(name: str) -> list[str]:
