@@ -38,7 +38,7 @@ def kept(tmp_path, ending):
 def test_it_is_kept_and_found(function):
     assert function()(2.0) == 5
     again = function()
-    assert again(2.0) == 5 and sum(again.stats.cache_hits.values()) == 1
+    assert again(2.0) == 5 and sum(again.entrance.stats.cache_hits.values()) == 1
 
 
 @pytest.mark.parametrize("ending", ["nbi", "nbc"])
@@ -56,7 +56,20 @@ def test_a_damaged_cache_is_made_anew(tmp_path, function, ending, damage):
         with pytest.warns(IllumgridWarning, match="compiler: compiled code on the disk cannot be read"):
             assert function()(2.0) == 5
     again = function()
-    assert again(2.0) == 5 and sum(again.stats.cache_hits.values()) == 1
+    assert again(2.0) == 5 and sum(again.entrance.stats.cache_hits.values()) == 1
+
+
+def test_python_may_call_what_compiled_code_calls(tmp_path, monkeypatch):
+    code = CODE + "\n@njit()\ndef g(x):\n    return f(x) + 1\n"
+    (tmp_path / "pair.py").write_text(code)
+    for _ in range(2):  # compiled, and from the disk, where code without an entrance must not pass for code with one
+        spec = importlib.util.spec_from_file_location("pair", tmp_path / "pair.py")
+        module = importlib.util.module_from_spec(spec)
+        monkeypatch.setitem(sys.modules, "pair", module)
+        spec.loader.exec_module(module)
+        assert module.g(2.0) == 6 and module.f(2.0) == 5
+    assert sum(module.f.entrance.stats.cache_hits.values()) == 1
+    assert sum(module.g.entrance.stats.cache_hits.values()) == 1
 
 
 def test_nowhere_to_write(tmp_path, function, monkeypatch):

@@ -2,39 +2,36 @@
 Two fields, one sweep
 =====================
 
-Figure 7 of Banks and Beason (2007): the densities of protons and neutrons in a nucleus, lit together. Each field has
-its own grid, and light is reflected between their isosurfaces; one slider moves both. The light textures of the walls
-depend on the slider, too.
+Figure 7 of Banks and Beason (2007) shows the densities of protons and neutrons in a nucleus, lit together. Each field
+has its own grid, and light is reflected between their isosurfaces; one slider moves both. The light textures of the
+walls depend on the slider, too.
 
-The scene is lit once; any of its isosurfaces can then be drawn without computing light again. The pictures below differ
-only in the isovalue. ``illumgrid preview nucleus-light --sweep 24 nucleus.webp`` makes a film of the sweep.
+The built-in scene follows the cluster model of beryllium-10: two clusters, in orange, and the neutrons that orbit both,
+in blue. It is lit once; any of its isosurfaces can then be drawn without computing light again. The pictures below
+differ only in the isovalue. ``illumgrid preview nucleus --sweep 24 nucleus.webp`` makes a film of the sweep.
 """
 
 import matplotlib.pyplot as plt
+from gallery_fields import command
 
-import illumgrid as ig
-from illumgrid.field.builtin import nucleus
-from illumgrid.show import fit_camera, render, widest_row
-
-scene = nucleus()
-light = ig.run(scene, grid=28, paths=48, isovalues=5)
+command("illumgrid run nucleus --paths 64 --no-preview -o nucleus")
+strip = command("illumgrid preview nucleus --isovalues 0.32,0.45,0.58 --size 480 360 -o fig7.png")
 
 # %%
-# **What to look for:** the shadows on the walls, and the red and green light that the walls reflect, follow the
-# surfaces from left to right. Blue surfaces tint the orange ones next to them.
+# **What to look for:** the shadow on the floor, and the red and green light that the walls reflect, follow the surfaces
+# from left to right, while the dumbbell comes apart. The ring tints the cluster within it.
 
-camera = fit_camera(scene, widest_row(scene), 4 / 3)
-figure, axes = plt.subplots(1, 3, figsize=(10.5, 3.0), facecolor="0.235", layout="constrained")
-for ax, row in zip(axes, scene.levels([0.05, 0.45, 0.95])):
-    ax.imshow(render(light, isovalue=row[0], width=480, height=360, camera=camera))
-    ax.set_title(f"isovalue {row[0]:.2f}", color="white")
-    ax.set_axis_off()
+figure, ax = plt.subplots(figsize=(10.5, 2.8), facecolor="0.235", layout="constrained")
+ax.imshow(strip)
+ax.set_axis_off()
 plt.show()
 
 # %%
-# With a lamp at the camera only, the picture does not show which surface is nearer unless their outlines overlap.
+# With a lamp at the camera only (left), the picture does not show how far the ring is from the walls, nor that light
+# comes from above.
 
-figure, ax = plt.subplots(figsize=(3.9, 3.0), facecolor="0.235", layout="constrained")
-ax.imshow(render(light, width=480, height=360, local=True))
+split = command("illumgrid preview nucleus --split --size 720 540 -o split.png")
+figure, ax = plt.subplots(figsize=(5.2, 3.9), facecolor="0.235", layout="constrained")
+ax.imshow(split)
 ax.set_axis_off()
 plt.show()

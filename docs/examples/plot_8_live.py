@@ -10,10 +10,11 @@ page.html`` writes it.
 from pathlib import Path
 
 import illumgrid as ig
-from illumgrid.field.builtin import nucleus
+from illumgrid.field.builtin import SCENES
 from illumgrid.show.viewer import page
 
-light = ig.run(nucleus(), grid=28, paths=96, isovalues=5)
+preset = SCENES["nucleus"]
+light = ig.run(preset.make(), grid=preset.grid, paths=preset.paths // 2, isovalues=preset.isovalues)
 
 folder = Path("../live")  # copied with these pages; outside the docs, the file goes to the current folder
 file = (folder if folder.is_dir() else Path()) / "nucleus-live.html"

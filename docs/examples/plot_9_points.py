@@ -11,12 +11,21 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import illumgrid as ig
-from illumgrid.field.builtin import nucleons
+from illumgrid.field.presets import studio_lights
 from illumgrid.show import render
 
 # %%
 # Figure 7: eight protons and eight neutrons, each a point spread by a Gaussian. Both fields share one sweep, here of
-# densities up to four fifths of the larger maximum.
+# densities up to four fifths of the larger maximum, in the light of the studio.
+
+
+def nucleons(count, turn):
+    """Points spread uniformly over a sphere (a Fibonacci lattice), and one at its centre."""
+    k = np.arange(count - 1) + 0.5
+    height, angle = 1 - 2 * k / (count - 1), np.pi * (1 + 5**0.5) * k + turn
+    ring = np.sqrt(1 - height**2)
+    return np.vstack([0.62 * np.stack([ring * np.cos(angle), ring * np.sin(angle), height], axis=1), np.zeros((1, 3))])
+
 
 protons, neutrons = (
     ig.density(points, spacing=1 / 20, sigma=0.16) for points in (nucleons(8, 0.0), nucleons(9, 1.2)[:8])
@@ -26,7 +35,8 @@ fields = (
     ig.Field("protons", protons, ig.Material((0.85, 0.42, 0.28)), limits),
     ig.Field("neutrons", neutrons, ig.Material((0.35, 0.55, 0.82)), limits),
 )
-nucleus = ig.run(ig.Scene(fields, (), (1, 1, 1)), grid=28, paths=32, bounces=4, isovalues=2)
+lights = studio_lights(ig.Scene(fields))
+nucleus = ig.run(ig.Scene(fields, lights=lights), grid=28, paths=32, bounces=4, isovalues=2)
 
 # %%
 # Figure 8: particles in a periodic cell. No two are nearer than 0.9, as in a liquid; what leaves the cell at one face

@@ -9,10 +9,12 @@ import hashlib
 import logging
 import pickle
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numba
 from numba.core.caching import CompileResultCacheImpl, FunctionCache
+from numba.core.registry import CPUDispatcher
 from numba.core.serialize import dumps
 
 from illumgrid.errors import tell
@@ -76,6 +78,44 @@ class _Cache(FunctionCache):
             _say("compiled code cannot be kept on the disk", problem)
 
 
+class _InnerSummed(_Summed):
+    """Of code without an entrance from Python, which must not be taken for code that has one."""
+
+    def get_filename_base(self, name: str, flags: str) -> str:
+        """A name of its own."""
+        return f"{super().get_filename_base(name, flags)}.inner"
+
+
+class _InnerCache(_Cache):
+    _impl_class = _InnerSummed
+
+
+class _Kernel(CPUDispatcher):
+    """A function that compiled code calls; `entrance` compiles it once more where Python calls it.
+
+    An entrance holds a copy of the function, so that compilation takes less time where inner functions have none.
+    """
+
+    entrance: Any
+
+    @property
+    def signatures(self) -> list[Any]:
+        """Types of arguments for which Python may call it without compilation."""
+        return list(self.entrance.signatures)
+
+    def __call__(self, *arguments: Any) -> Any:
+        return self.entrance(*arguments)
+
+
+def _kept(dispatcher: Any, cache: type[_Cache]) -> Any:
+    """The dispatcher, with a cache on the disk where that is possible."""
+    try:
+        dispatcher._cache = cache(dispatcher.py_func)  # as its method enable_caching does
+    except (RuntimeError, OSError) as problem:
+        _say("compiled code cannot be kept on the disk", problem)
+    return dispatcher
+
+
 def njit(**options: Any) -> Callable[[Any], Any]:
     """Compile a function, and keep what comes out on the disk where that is possible.
 
@@ -83,12 +123,13 @@ def njit(**options: Any) -> Callable[[Any], Any]:
     """
 
     def made(function: Any) -> Any:
-        dispatcher = numba.njit(nogil=True, error_model="numpy", **options)(function)
-        if hasattr(dispatcher, "py_func"):  # not with NUMBA_DISABLE_JIT=1
-            try:
-                dispatcher._cache = _Cache(function)  # as its method enable_caching does
-            except (RuntimeError, OSError) as problem:
-                _say("compiled code cannot be kept on the disk", problem)
-        return dispatcher
+        compile_ = partial(numba.njit, nogil=True, error_model="numpy", no_cfunc_wrapper=True, **options)
+        entrance = compile_()(function)
+        if not hasattr(entrance, "py_func"):  # with NUMBA_DISABLE_JIT=1
+            return entrance
+        kernel = _kept(compile_(no_cpython_wrapper=True)(function), _InnerCache)
+        kernel.__class__ = _Kernel
+        kernel.entrance = _kept(entrance, _Cache)
+        return kernel
 
     return made

@@ -1,16 +1,17 @@
 """Built-in synthetic scenes, which need no data."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from illumgrid.field.scene import Field, Material, Scene, box_around, with_texels
+from illumgrid.field.scene import Field, Material, Scene, box_around
 from illumgrid.field.volume import Floats, Volume
 
-_VOXELS = 64
-_RADIUS = 0.62  # of the sphere that carries the nucleons of one kind; the volume spans -1 to 1
-_SPREAD = 0.16  # standard deviation of the kernel
+_VOXELS = 48  # along each axis of the volumes, which span -1 to 1
+_AXIS = np.array([0.5, -0.35, 0.8]) / np.linalg.norm([0.5, -0.35, 0.8])  # tilted, so that one sees through the ring
+_APART, _SPREAD = 0.36, 0.21  # of a cluster from the centre, and its standard deviation
+_RING, _FLAT = 0.66, 0.22  # radius of the ring at its largest density, and its extent along the axis
 
 
 def spread(points: Floats, voxels: int = _VOXELS, sigma: float = _SPREAD) -> Volume:
@@ -18,31 +19,39 @@ def spread(points: Floats, voxels: int = _VOXELS, sigma: float = _SPREAD) -> Vol
     axis = np.linspace(-1.0, 1.0, voxels)
     # A Gaussian is a product over the axes.
     along = [np.exp(-((axis[:, None] - points[:, a]) ** 2) / (2 * sigma**2)) for a in range(3)]
-    density = np.einsum("in,jn,kn->ijk", *along)
-    step = 2.0 / (voxels - 1)
+    return _scaled(np.einsum("in,jn,kn->ijk", *along))
+
+
+def _scaled(density: Floats) -> Volume:
+    """A density on [-1, 1]³, with a maximum of 1."""
+    step = 2.0 / (len(density) - 1)
     return Volume(density / density.max(), origin=np.full(3, -1.0), spacing=np.full(3, step))
 
 
-def nucleons(count: int, turn: float) -> Floats:
-    """Point masses (count, 3) distributed uniformly over a sphere (a Fibonacci lattice), and one at its centre."""
-    k = np.arange(count - 1) + 0.5
-    height, angle = 1 - 2 * k / (count - 1), np.pi * (1 + 5**0.5) * k + turn
-    ring = np.sqrt(1 - height**2)
-    return np.vstack(
-        [_RADIUS * np.stack([ring * np.cos(angle), ring * np.sin(angle), height], axis=1), np.zeros((1, 3))]
-    )
+def _ring() -> Volume:
+    """Density of an orbital around the axis: no node but the axis itself, on which it vanishes."""
+    x = np.stack(np.meshgrid(*[np.linspace(-1.0, 1.0, _VOXELS)] * 3, indexing="ij"), axis=-1)
+    along = x @ _AXIS
+    round_ = ((x**2).sum(axis=-1) - along**2) / _RING**2
+    return _scaled((round_ * np.exp(-round_)) ** 2 * np.exp(-((along / _FLAT) ** 2)))
 
 
 def nucleus() -> Scene:
-    """Densities of eight protons and eight neutrons in a box with a lamp (after Figure 7 of Banks & Beason 2007)."""
-    protons = Material(np.array([0.85, 0.42, 0.28]))
-    neutrons = Material(np.array([0.35, 0.55, 0.82]))
-    limits = np.array([0.15, 0.75])
+    """Two clusters of protons, and the neutrons that orbit both, in a box whose ceiling shines.
+
+    After Figure 7 of Banks & Beason (2007), two fields in a box, and the cluster model of beryllium-10: two alpha
+    particles share two neutrons (W. von Oertzen, M. Freer and Y. Kanada-En'yo, Physics Reports 432, 2006).
+    """
+    protons, neutrons = Material(np.array([0.9, 0.45, 0.22])), Material(np.array([0.35, 0.55, 0.85]))
+    limits = np.array([0.3, 0.6])
     fields = (
-        Field("protons", spread(nucleons(8, 0.0)), protons, limits),
-        Field("neutrons", spread(nucleons(9, 1.2)[:8]), neutrons, limits),
+        Field("protons", spread(_APART * np.stack([_AXIS, -_AXIS])), protons, limits),
+        Field("neutrons", _ring(), neutrons, limits),
     )
-    return with_texels(Scene(fields, box_around(fields[0].volume)), 16)  # as many texels as nodes, or fewer
+    walls = {quad.name: quad for quad in box_around(fields[0].volume, margin=0.3)}
+    shining = Material(np.zeros(3), np.full(3, 2.5))
+    walls["lamp"] = replace(walls.pop("ceiling"), name="lamp", material=shining, texels=(1, 1))
+    return Scene(fields, tuple(walls.values()))
 
 
 @dataclass(frozen=True)
@@ -55,4 +64,4 @@ class Preset:
     isovalues: int
 
 
-SCENES = {"nucleus": Preset(nucleus, grid=28, paths=64, isovalues=5)}
+SCENES = {"nucleus": Preset(nucleus, grid=36, paths=128, isovalues=5)}
