@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 
 import illumgrid as ig
+from illumgrid.backends.reference import place_in_sweep
+from illumgrid.field.levelset import turned_levels
 from illumgrid.field.scene import Material, Quad, Scene
 from illumgrid.show import fit_camera, render
 from illumgrid.show.engines import software
-from illumgrid.show.exact import Exact
+from illumgrid.show.exact import Exact, cache_at
 from illumgrid.show.looks import Layer, arriving, coated, displayed, layers_of
 from illumgrid.show.shade import Shown
 from illumgrid.tone import decode_srgb
@@ -128,6 +130,20 @@ def test_a_ball_within_a_film_is_seen_with_light_of_its_own():
     picture = decode_srgb(render(light, **SMALL, background="#000000", exact=Exact(16)))[9, 12]
     dark, red = picture[2], picture[0]
     assert red / dark == pytest.approx(5.0, rel=0.1)  # the albedo of the core, and no light of the film
+
+
+def test_rays_end_in_the_light_of_a_level_that_is_held():
+    """Its place in the sweep is that of the picture, and its light that of a lookup there."""
+    scene = sky(ball(12), limits=(0.3, 0.6))
+    core = replace(scene.fields[0], name="core", isovalue=0.9, range=None)
+    light = ig.run(replace(scene, fields=(scene.fields[0], core)), grid=5, paths=4, bounces=1, isovalues=2, seed=0)
+    assert light.grids[1].rows
+    for share in (0.2, 0.8):
+        cache, row = cache_at(light, share), light.scene.levels(share)[0]
+        assert place_in_sweep(cache, turned_levels(light.scene, row)[None])[0] == pytest.approx(share)
+        spec = light.grids[1].spec
+        nodes = cache.light[cache.start[1] :].reshape(*spec.shape, -1)
+        assert nodes[..., 0].ravel() == pytest.approx(light.grids[1].lookup(spec.nodes(), share)[:, 0], rel=1e-5)
 
 
 def _layers(light) -> list[Layer]:

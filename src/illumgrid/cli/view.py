@@ -8,6 +8,7 @@ import typer
 
 from illumgrid.cli.lights import SkyImage, Turn, Weights, relit
 from illumgrid.cli.long import loaded
+from illumgrid.cli.looks import Color, ColorMap, ColorRange, Look, looking, tint_of
 from illumgrid.cli.terminal import say
 from illumgrid.errors import BadInput
 
@@ -24,6 +25,10 @@ def view(
     weights: Weights = None,
     sky: SkyImage = None,
     turn: Turn = 0.0,
+    look: Look = None,
+    color: Color = None,
+    cmap: ColorMap = "viridis",
+    color_range: ColorRange = None,
     up: Annotated[
         str | None,
         typer.Option(metavar="AXIS", help="World axis that points up: x, y, z, -x, -y, -z. [default: z, see docs]"),
@@ -36,7 +41,10 @@ def view(
         raise BadInput(f"--export is {export.name!r}; expected a file name that ends in .html")
     if desktop and (export is not None or no_open):
         raise BadInput("--desktop came with --export or --no-open; expected it without them")
-    light = relit(loaded(folder), weights, sky, turn)
+    light = looking(relit(loaded(folder), weights, sky, turn), look)
+    tint = tint_of(light, color, cmap, color_range)
+    if desktop and (tint is not None or look):
+        raise BadInput("--desktop came with --look or --color; expected it without them: its window shows light alone")
     if desktop:
         from illumgrid.show.viewer.desktop import show
 
@@ -44,7 +52,7 @@ def view(
         return
     from illumgrid.show.viewer import page
 
-    text = page(light, up).encode()
+    text = page(light, up, tint).encode()
     if export is not None:
         disk.write_file(export, text)
         say(f"wrote {export}, {len(text) / 1e6:.1f} MB: open it in any browser")

@@ -7,7 +7,7 @@ off enters through two reflections only, averaged over hemispheres, and shadows 
 
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from itertools import pairwise
 
@@ -18,6 +18,8 @@ from illumgrid.bake.accumulator import Progress
 from illumgrid.bake.bounces import enough_bounces
 from illumgrid.errors import BadInput
 from illumgrid.field.volume import Floats
+from illumgrid.grid import IlluminationGrid
+from illumgrid.grid.cache import Cache, cache_of
 from illumgrid.light import Illumination
 from illumgrid.rng import shifted_seed
 from illumgrid.show.camera import Camera
@@ -57,22 +59,42 @@ class Exact:
             raise BadInput(f"{self.paths} paths a pixel were asked for; expected 1 to {MOST_PATHS}")
 
 
-def tracer_of(light: Illumination, full: bool) -> tuple["Callable[..., tuple[Colors, NDArray[np.int32]]]", int]:
+def cache_at(light: Illumination, share: float) -> Cache:
+    """The light as a cache for one place in the sweep, 0 to 1: that of held levels is taken there."""
+    held = [grid if not grid.rows else _mixed(grid, share) for grid in light.grids]
+    cache = cache_of(light.scene, held, light.walls, after=1)
+    for number, field in enumerate(light.scene.fields):
+        if field.isovalue is not None:  # a stretch about its level in which that has the same place
+            cache.sweep[number] += np.array([-share, 1.0 - share]) * max(1.0, abs(cache.sweep[number, 0]))
+    return cache
+
+
+def _mixed(grid: IlluminationGrid, share: float) -> IlluminationGrid:
+    place = share * (len(grid.rows) - 1)
+    below = min(int(place), len(grid.rows) - 2)
+    one, other = (row.light for row in grid.rows[below : below + 2])
+    return replace(grid, values=one + np.float32(place - below) * (other - one), rows=())
+
+
+def tracer_of(
+    light: Illumination, full: bool, share: float = 0.5
+) -> tuple["Callable[..., tuple[Colors, NDArray[np.int32]]]", int]:
     """What answers queries, with irradiance (n, 3) in the mix of the light and the paths walked (n,), and its bounces.
 
-    It is kept with the light, for further pictures.
+    It is kept with the light, for further pictures; if levels are held, for those at one place in the sweep.
     """
     from illumgrid.backends.numba_ import Numba
-    from illumgrid.grid.cache import cache_of
     from illumgrid.transport.tracer import prepare
 
     key = "_followed" if full else "_gathered"
+    if not full and any(grid.rows for grid in light.grids):
+        key += f"_{share!r}"
     if key not in light.__dict__:
         if full:
             tracer = prepare(Numba(), light.scene)
             bounces = 2 * enough_bounces(light.scene, tracer)[0]  # of what was left out a square is left out
         else:
-            tracer = prepare(Numba(), light.scene, cache_of(light.scene, light.grids, light.walls, after=1))
+            tracer = prepare(Numba(), light.scene, cache_at(light, share))
             bounces = int(light.recipe.get("bounces", 8)) + 2
         light.__dict__[key] = tracer, bounces
     tracer, bounces = light.__dict__[key]
@@ -147,7 +169,7 @@ class Gathering:
         lookup L tell both apart: the mean of (G - G')² is twice the variance of each, that of (L - G)(L - G') the
         variance of L, whatever its cause. Its own standard error is added: little trust where little is known.
         """
-        solve, _ = tracer_of(self.shown.light, False)
+        solve, _ = tracer_of(self.shown.light, False, self.shown.share)
         random = np.random.default_rng(self.seed)
         across, down = random.random((2, _PILOT_RAYS)) * 2 - 1
         camera, aspect = self.camera, self.width / self.height
@@ -268,7 +290,7 @@ class Gathering:
         The four sub-samples of a pixel share the paths of one sequence, a quarter of each step for each; returns the
         pixels that they belong to, counted from that row. The `inner` sides (n,) of films are left out.
         """
-        solve, _ = tracer_of(self.shown.light, self.exact.full)
+        solve, _ = tracer_of(self.shown.light, self.exact.full, self.shown.share)
         pixel, place = self._pixels(len(hits.what))
         lit = np.concatenate([hits.lit(k) for k in range(self.surfaces)])
         lit = lit if inner is None else lit[~inner[lit]]

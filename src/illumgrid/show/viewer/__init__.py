@@ -11,9 +11,12 @@ import json
 import re
 from functools import cache
 from importlib.resources import files
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from illumgrid.light import Illumination
+
+if TYPE_CHECKING:
+    from illumgrid.show.tints import Tint
 
 MODULES = (
     "numbers",
@@ -68,7 +71,7 @@ def policy(text: str) -> str:
     return f"default-src 'none'; {allowed}; base-uri 'none'; form-action 'none'"
 
 
-def page(light: Illumination, up: str | None = None) -> str:
+def page(light: Illumination, up: str | None = None, tint: "Tint | None" = None) -> str:
     """One HTML file that holds everything: it opens from disk and makes no network request.
 
     Parameters
@@ -76,15 +79,17 @@ def page(light: Illumination, up: str | None = None) -> str:
     light : Illumination
     up : str, optional
         World direction that is up, as in `illumgrid.show.fit_camera`.
+    tint : Tint, optional
+        A second quantity that colours all fields.
 
     Returns
     -------
     str
-        The file's text; about the size of the gzipped field and grid, times 4/3, and 85 KB.
+        The file's text; about the size of the gzipped field and grid, times 4/3, and 95 KB.
     """
     from illumgrid.show.viewer.packing import packed
 
-    scene, data = packed(light, up)
+    scene, data = packed(light, up, tint)
     parts = {
         "title": html.escape(scene["title"]) + " · illumgrid",
         "style": source("view.css"),

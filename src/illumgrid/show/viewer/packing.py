@@ -18,9 +18,11 @@ from illumgrid.field.volume import Floats, Lattice, box_corners, histogram
 from illumgrid.grid.channels import Channels
 from illumgrid.grid.nodes import reachable
 from illumgrid.light import Illumination
-from illumgrid.show import trust
+from illumgrid.show import cuts, trust
 from illumgrid.show.camera import HALF_ANGLE, fit_camera, outline_of
+from illumgrid.show.looks import displayed
 from illumgrid.show.shade import BACKGROUND, CAP_TONE, fades
+from illumgrid.show.tints import Tint
 from illumgrid.show.viewer import resting, skies
 from illumgrid.show.viewer.arrays import (
     HOLE,
@@ -91,15 +93,20 @@ def _field(light: Illumination, number: int, stage: Stage, into: Bytes, notes: l
     most = min(MOST_NODES, int(min(1.0, room / (skies.FEWEST + skies.FINE)) * whole.support.size))
     volume, grid = reduced(field.volume, MOST_VOXELS), thinned(whole, most)
     sign = field.upward
-    ends = sorted(sign * field.stored_range)
+    swept = field.stored_range if field.isovalue is None else np.array(field.volume.stored_extremes, float)
+    ends = sorted(sign * swept)
     steps, base, step, clamped = field_steps(volume, (ends[0], ends[1]), sign)
     _note_reduced(notes, f"The field of {field.name}", "voxels", field.volume.shape, volume.shape)
     _note_reduced(notes, f"The light of {field.name}", "nodes", whole.spec.shape, grid.spec.shape)
+    if grid.rows or whole.rows:
+        notes.append(f"The light of {field.name}, whose level is held, is that of the middle of the sweep.")
     if clamped:
         notes.append(f"Values of {field.name} far outside the swept range were clamped for this page.")
     texture = np.diag([*(1 / np.array(grid.spec.shape)), 1.0])
     texture[:3, 3] = 0.5 / np.array(grid.spec.shape)
-    albedo = field.material.albedo
+    material, through = field.material, displayed(light.scene).fields[number].material.transmission
+    shown_albedo = displayed(light.scene).fields[number].material.albedo / max(1 - through, 1e-9)
+    albedo = material.albedo
     error = np.where(np.isfinite(grid.bar), trust.relative(whole, grid.bar), HOLE)
     scale = light.exposure / np.pi
     shown = pack_light(_mix(grid.channels, grid.light) * scale, error, into)
@@ -119,7 +126,10 @@ def _field(light: Illumination, number: int, stage: Stage, into: Bytes, notes: l
         "range": field.range.tolist(),
         "sweep": field.sweep.tolist(),
         "upward": sign,
-        "albedo": albedo.tolist(),
+        "albedo": shown_albedo.tolist(),  # of what is not seen through
+        "through": through,
+        "rough": material.roughness,
+        "window": [(sign * float(x) - base) / step for x in field.volume.to_stored(cuts.window(field))],
         "swatch": _css(WHITE * albedo / albedo.max(initial=1e-9)),
         "histogram": _histogram(field),
         "values": pack_values(steps, into)
@@ -223,13 +233,32 @@ def _between(colors: Floats, steps: int = 13) -> Floats:
     return np.stack([np.interp(at, np.arange(len(colors)), channel) for channel in colors.T], axis=1)
 
 
-def packed(light: Illumination, up: str | None = None) -> tuple[dict[str, Any], bytes]:
+def _tint(tint: Tint, stage: Stage, into: Bytes) -> dict[str, Any]:
+    """A second quantity in 256 steps, and its colours."""
+    volume = reduced(tint.volume, MOST_NODES)
+    low, high = tint.ends
+    share = np.clip((volume.values.astype(float) - low) / (high - low), 0.0, 1.0)
+    texture = np.diag([*(1 / np.array(volume.shape)), 1.0])
+    texture[:3, 3] = 0.5 / np.array(volume.shape)
+    return {
+        "name": tint.name,
+        "ends": [low, high],
+        "colors": [f"#{bytes(color).hex()}" for color in tint.table[::15]],
+        "map": into.add(tint.table.tobytes()),
+        "values": pack_values(np.round(255 * np.nan_to_num(share)).astype(np.uint8), into),
+        "toTexture": (texture @ stage.to_index(volume)).T.ravel().tolist(),
+    }
+
+
+def packed(light: Illumination, up: str | None = None, tint: Tint | None = None) -> tuple[dict[str, Any], bytes]:
     """Description of a scene for the page, and the arrays that it points into; `up` as in `fit_camera`."""
     scene, into = light.scene, Bytes()
     stage, notes = Stage.of(scene), list[str]()
     fields = [_field(light, number, stage, into, notes) for number in range(len(scene.fields))]
     walls, atlas = _walls(light, stage, into)
-    ranges = shown_range(scene.fields[0].range, 6)
+    lead = next((k for k, field in enumerate(scene.fields) if field.isovalue is None), 0)
+    ranges = shown_range(scene.fields[lead].range, 6)
+    box = np.concatenate([stage.place(box_corners(field.volume)) for field in scene.fields])
     several = "all fields share one sweep" if len(fields) > 1 else f"light for isovalues {ranges}"
     described = {
         "title": ", ".join(f.name for f in scene.fields),
@@ -253,6 +282,14 @@ def packed(light: Illumination, up: str | None = None) -> tuple[dict[str, Any], 
         "resting": resting.described(light, list(kept_apart(light))),
         "lights": [{"name": name, "weight": weight} for name, weight in kept_apart(light).items()],
         "fields": fields,
+        "lead": lead,
+        "clip": {
+            "low": box.min(axis=0).tolist(),
+            "high": box.max(axis=0).tolist(),
+            "middle": stage.middle.tolist(),
+            "size": stage.size,
+        },
+        "tint": None if tint is None else _tint(tint, stage, into),
         "walls": walls,
         "atlas": atlas,
     }

@@ -16,15 +16,12 @@ def described(light: Illumination, names: list[str]) -> dict[str, Any] | None:
     """Lights as the exposure shows them, each with its number among the page's sliders `names`, -1 if it has none.
 
     None where the page would need more than it holds: under images of the sky, in which a ray finds what is small and
-    bright too seldom, beside fields that shine, transmit or are held at one level, and with more surfaces than
-    `MOST_SURFACES`.
+    bright too seldom, beside fields that shine, and with more surfaces than `MOST_SURFACES`.
     """
     scene = light.scene
     materials = [field.material for field in scene.fields]
-    held = any(field.isovalue is not None for field in scene.fields)
     images = any(isinstance(one, Sky) and one.radiance.ndim == 3 for one in scene.lights)
-    special = any(m.emission.any() or m.transmission for m in materials)
-    if images or special or held or len(scene.fields) + len(scene.quads) > MOST_SURFACES:
+    if images or any(m.emission.any() for m in materials) or len(scene.fields) + len(scene.quads) > MOST_SURFACES:
         return None
 
     def weighed(name: str) -> tuple[int, float]:

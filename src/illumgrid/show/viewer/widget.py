@@ -61,7 +61,7 @@ def widget(light: Illumination, isovalue: float | None = None, height: int = 520
     from illumgrid.show.viewer.packing import kept_apart, packed
 
     scene, data = packed(light, up)
-    low, high = map(float, light.scene.fields[0].range)
+    low, high = map(float, light.scene.fields[scene["lead"]].range)
     made = view(
         height=height,
         _scene=json.dumps(scene, allow_nan=False),

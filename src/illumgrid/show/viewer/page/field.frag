@@ -2,6 +2,12 @@
 uniform vec3 uEye;
 uniform sampler2D uFront;            // depth of the layer in front, when layers are peeled
 uniform bool uPeel;
+uniform float uRough;                // of the surface's own coat, below 0 without; only rays at rest know how rough
+uniform vec2 uWindow;                // values in steps that a cut shows black and white
+uniform bool uTint;                  // colours of a second quantity
+uniform sampler3D uSecond;
+uniform sampler2D uMap;
+uniform mat4 uToSecond;
 
 in vec3 vRay;
 
@@ -30,15 +36,24 @@ void main() {
     from = depth < 1.0 ? distanceOf(depth) + 0.004 / length(mat3(uToIndex) * ray) : 1e9;
   }
   int what;
-  float t = march((uToIndex * vec4(uEye, 1.0)).xyz, mat3(uToIndex) * ray, from, what);
+  float t = march_clipped(uEye, ray, from, what);
   if (what == NOTHING) discard;
   gl_FragDepth = depthOf(t);
   vec3 place = uEye + t * ray;
+  if (what == CUT) {                 // the data, as values of sRGB
+    vec3 at = (uToIndex * vec4(place, 1.0)).xyz;
+    ivec3 cell = clamp(ivec3(at), ivec3(0), textureSize(uField, 0) - 2);
+    vec4 near, far;
+    corners(cell, near, far);
+    float grey = clamp((trilinear(near, far, at - vec3(cell)) + uLevel - uWindow.x) / (uWindow.y - uWindow.x), 0.0, 1.0);
+    draw(vec3(grey <= 0.04045 ? grey / 12.92 : pow((grey + 0.055) / 1.055, 2.4)), 1.0);
+    return;
+  }
   if (what == CAP) { draw(uCapTone * (isTrust() ? vec3(0.5) : uAlbedo), 1.0); return; }
   vec3 texel = (uToTexture * vec4(place, 1.0)).xyz;
   bool local = isLocal();
   vec3 normal = vec3(0.0);
-  if (local || uLook != MATTE || isTrust()) {
+  if (local || uLook != MATTE || uRough >= 0.0 || isTrust()) {
     normal = -normalize(transpose(mat3(uToIndex)) * gradient((uToIndex * vec4(place, 1.0)).xyz));
   }
   float facing = abs(dot(normal, ray));
@@ -46,6 +61,14 @@ void main() {
   vec3 color, light = lightOf(texture(uLight, texel));
   if (local) color = uGain * uWhite * uAlbedo / max(most(uAlbedo), 1e-9) * max(-dot(normal, ray), uBothSides ? facing : 0.0);
   else color = uGain * uAlbedo * light;
-  if (uLook == SHINY) color = 0.8 * color + gloss(normal, ray, local ? vec3(uWhite) : light);
-  draw(curve(color), uLook == TRANSLUCENT ? 1.0 - pow(0.62, 1.0 / max(facing, 0.12)) : 1.0);
+  if (uTint) {
+    vec3 base = texture(uMap, vec2(texture(uSecond, (uToSecond * vec4(place, 1.0)).xyz).r * 255.0 / 256.0 + 0.5 / 256.0, 0.5)).rgb;
+    color = base * (local ? facing * uGain * uWhite : dot(curve(uGain * light), vec3(0.2126, 0.7152, 0.0722)));
+  }
+  if (!uRaw && (uLook == SHINY || uRough >= 0.0)) color = 0.8 * color + gloss(normal, ray, local ? vec3(uWhite) : light);
+  float there = opaque(facing);
+  if (uLook != TRANSLUCENT) color *= there;   // the tone curve sees what the surface adds, as in the pictures
+  draw(uTint ? color : curve(color), 1.0);
+  color_.a = there;
+  if (uLook == TRANSLUCENT) color_.rgb *= there;
 }

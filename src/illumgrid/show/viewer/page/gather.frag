@@ -10,10 +10,16 @@ void main() {
   ivec3 cell = clamp(ivec3(floor(start)), ivec3(0), textureSize(uField, 0) - 2);
   vec4 near, far;
   corners(cell, near, far);
+  float from = uBothSides ? 0.004 / length(ahead) : 0.0;
   bool dips = ray.id == uId && cubic(near, far, start - vec3(cell), ahead).y > 0.0;   // under the surface that it leaves
-  if (!dips) t = march(start, ahead, 0.0, what);
+  for (int k = 0; k < 4 && !dips; k++) {
+    t = march(start, ahead, from, what);
+    if (what != SURFACE || uThrough <= 0.0 || chance(float(k) + 5.0 + float(uAim)) > uThrough) break;
+    from = t + 0.004 / length(ahead);
+    what = NOTHING;
+  }
   if (what == NOTHING || t >= ray.reach) discard;
   gl_FragDepth = depthOf(t);
   vec3 texel = (uToTexture * vec4(ray.start + t * ray.ahead, 1.0)).xyz;
-  color_ = vec4(uAim == OPEN ? uAlbedo * lightOf(texture(uLight, texel)) : vec3(0.0), 1.0);
+  color_ = vec4(uAim == OPEN || uAim == MIRROR ? ray.worth * uAlbedo * lightOf(texture(uLight, texel)) : vec3(0.0), 1.0);
 }

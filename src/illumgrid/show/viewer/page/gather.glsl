@@ -1,5 +1,5 @@
 // One ray from each pixel's origin: cosine-distributed, or to a light that shadow rays ask for.
-const int OPEN = 0, DISC = 1, LAMP = 2;
+const int OPEN = 0, DISC = 1, LAMP = 2, MIRROR = 3;
 
 uniform sampler2D uPlace, uNormals;  // of origins, see origin.frag
 uniform int uAim;
@@ -8,6 +8,8 @@ uniform vec3 uAxis;                  // of a disc of the sky,
 uniform float uCosine;               // and the cosine of its half-angle
 uniform vec3 uLamp0, uLampU, uLampV, uLampNormal;
 uniform vec3 uShine;                 // radiance of the disc or the lamp, as the exposure shows it
+uniform vec3 uEyeAt;
+uniform float uCoats[16];            // roughness of each surface's coat, below 0 without
 
 struct Ray { vec3 start, ahead; float id, reach, worth; };
 
@@ -18,6 +20,22 @@ void basisOf(vec3 n, out vec3 a, out vec3 b) {   // Duff et al., JCGT 6(1), 2017
   float s = n.z < 0.0 ? -1.0 : 1.0, c = -1.0 / (s + n.z), d = n.x * n.y * c;
   a = vec3(1.0 + s * n.x * n.x * c, s * d, -s * n.x);
   b = vec3(d, s + n.y * n.y * c, -n.y);
+}
+
+// The reflected ray of a rough coat: Heitz, JCGT 7(4), 2018; Schlick, CGF 13(3), 1994.
+void mirror(inout Ray ray, vec3 n, float rough, vec2 u) {
+  float alpha = max(rough * rough, 1e-3), angle = 6.2831853 * u.y;
+  vec3 a, b, view = normalize(uEyeAt - ray.start);
+  basisOf(n, a, b);
+  vec3 v = vec3(dot(a, view), dot(b, view), max(dot(n, view), 1e-3)), s = normalize(vec3(alpha * v.xy, v.z));
+  vec3 p = length(s.xy) > 0.0 ? vec3(-s.y, s.x, 0.0) / length(s.xy) : vec3(1.0, 0.0, 0.0), q = cross(s, p);
+  float x = sqrt(u.x) * cos(angle), y = mix(sqrt(max(1.0 - x * x, 0.0)), sqrt(u.x) * sin(angle), 0.5 * (1.0 + s.z));
+  vec3 h = x * p + y * q + sqrt(max(0.0, 1.0 - x * x - y * y)) * s;
+  h = normalize(vec3(alpha * h.xy, max(h.z, 0.0)));
+  vec3 d = 2.0 * dot(v, h) * h - v;
+  float to = 0.5 * (sqrt(1.0 + alpha * alpha * (1.0 / (v.z * v.z) - 1.0)) - 1.0), from = 0.5 * (sqrt(1.0 + alpha * alpha * (1.0 / max(d.z * d.z, 1e-6) - 1.0)) - 1.0);
+  ray.ahead = d.x * a + d.y * b + d.z * n;
+  ray.worth = d.z > 0.0 ? (0.04 + 0.96 * pow(1.0 - clamp(dot(v, h), 0.0, 1.0), 5.0)) * (1.0 + to) / (1.0 + to + from) : 0.0;
 }
 
 // `worth` turns the radiance that the ray finds into light of the origin, in the units of the light's textures.
@@ -38,6 +56,10 @@ Ray gathered() {
     basisOf(uAxis, a, b);
     ray.ahead = sine * (cos(angle) * a + sin(angle) * b) + cosine * uAxis;
     ray.worth = 2.0 * (1.0 - uCosine) * max(dot(ray.ahead, normal), 0.0);
+  } else if (uAim == MIRROR) {
+    float rough = ray.id < 0.0 ? -1.0 : uCoats[int(ray.id)];
+    ray.worth = 0.0;
+    if (rough >= 0.0) mirror(ray, normal, rough, u);
   } else {
     float sine = sqrt(u.x);
     basisOf(normal, a, b);

@@ -1,4 +1,6 @@
 // What gathered rays find where nothing stands in their way: the sky, or the light that they were sent to.
+uniform vec4 uDiscs[8];              // axes of discs of the sky and cosines of their half-angles, for coats
+uniform vec3 uDiscShine[8];
 uniform vec3 uSky[25], uSkyAxes[3];  // coefficients as in skies.js; right, back and up
 
 vec3 sky(vec3 ray) {
@@ -18,5 +20,7 @@ void main() {
   Ray ray = gathered();
   if (ray.id < 0.0) discard;
   gl_FragDepth = uAim == LAMP ? depthOf(0.9999 * ray.reach) : 1.0;
-  color_ = vec4(ray.worth * (uAim == OPEN ? sky(ray.ahead) : uShine), 1.0);
+  vec3 light = uAim == OPEN || uAim == MIRROR ? sky(ray.ahead) : uShine;
+  if (uAim == MIRROR) for (int k = 0; k < 8; k++) if (dot(uDiscs[k].xyz, ray.ahead) > uDiscs[k].w) light += uDiscShine[k];
+  color_ = vec4(ray.worth * light, 1.0);
 }

@@ -1,6 +1,6 @@
 // What gathered rays meet of one wall.
 uniform sampler3D uWalls;
-uniform vec3 uCorner, uEdgeU, uEdgeV, uNormal, uAlbedo;
+uniform vec3 uCorner, uEdgeU, uEdgeV, uNormal, uAlbedo, uEmission;
 uniform vec2 uTexels, uOffset;
 uniform float uRow, uId;
 
@@ -15,5 +15,7 @@ void main() {
   gl_FragDepth = depthOf(t);
   vec2 texel = uOffset + clamp(place * uTexels, vec2(0.5), uTexels - 0.5);
   vec3 light = lightOf(texture(uWalls, vec3(texel / vec2(textureSize(uWalls, 0).xy), uRow)));
-  color_ = vec4(uAim == OPEN && toward < 0.0 ? uAlbedo * light : vec3(0.0), 1.0);   // its back is dark
+  if (uAim == OPEN || uAim == MIRROR) light = ray.worth * (uAlbedo * light + (uAim == MIRROR ? uEmission : vec3(0.0)));
+  else light = vec3(0.0);
+  color_ = vec4(toward < 0.0 ? light : vec3(0.0), 1.0);   // its back is dark
 }

@@ -9,6 +9,12 @@ uniform mat4 uToIndex, uToTexture;   // from the stage to voxel indices, and to 
 uniform float uLevel;                // isovalue in steps
 uniform vec3 uAlbedo;
 uniform bool uBothSides;             // a translucent surface is seen from its back too
+uniform float uThrough, uRoll;       // share of what lies behind that is seen; a number that is another for each ray
+uniform vec4 uClip;                  // of rays from the eye: what has a larger product with .xyz than .w is not there
+float chance(float k) { return fract(52.9829189 * fract(dot(gl_FragCoord.xy + 17.3 * k, vec2(0.06711056, 0.00583715))) + uRoll + 0.618034 * k); }
+
+// How much of a surface is there that faces a ray by this cosine.
+float opaque(float facing) { return uLook == TRANSLUCENT ? 1.0 - pow(0.62, 1.0 / max(facing, 0.12)) : 1.0 - uThrough; }
 float value(ivec3 voxel) { return float(texelFetch(uField, voxel, 0).r); }
 float least(vec3 v) { return min(v.x, min(v.y, v.z)); }
 float most(vec3 v) { return max(v.x, max(v.y, v.z)); }
@@ -147,4 +153,26 @@ vec3 gradient(vec3 index) {
   vec4 z = mix(n, r, f.z);
   vec2 y = mix(z.xy, z.zw, f.y);
   return vec3(y.y - y.x, mix(z.z - z.x, z.w - z.y, f.x), mix(mix(r.x - n.x, r.y - n.y, f.x), mix(r.z - n.z, r.w - n.w, f.x), f.y));
+}
+
+// What a ray from the eye meets within the clip plane, beyond `from`.
+const int CUT = 3;
+float march_clipped(vec3 eye, vec3 ray, float from, out int what) {
+  float along = dot(uClip.xyz, ray), room = uClip.w - dot(uClip.xyz, eye), enter = along < 0.0 ? room / along : 0.0;
+  vec3 start = (uToIndex * vec4(eye, 1.0)).xyz, ahead = mat3(uToIndex) * ray;
+  what = NOTHING;
+  if (along >= 0.0 && room < 0.0) return 0.0;
+  if (enter > max(from, 0.0)) {
+    from = enter;
+    vec3 at = start + enter * ahead, top = vec3(textureSize(uField, 0) - 1);
+    if (uThrough == 0.0 && uLook != TRANSLUCENT && at == clamp(at, vec3(0.0), top)) {
+      ivec3 cell = min(ivec3(at), ivec3(top) - 1);
+      vec4 near, far;
+      corners(cell, near, far);
+      if (trilinear(near, far, at - vec3(cell)) >= 0.0) { what = CUT; return enter; }
+    }
+  }
+  float t = march(start, ahead, from, what);
+  if (along > 0.0 && t > room / along) what = NOTHING;
+  return t;
 }

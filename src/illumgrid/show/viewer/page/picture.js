@@ -35,6 +35,7 @@ export function set(gl, { at }, values) {
     [gl.FLOAT]: (p, v) => (v.length ? gl.uniform1fv(p, v) : gl.uniform1f(p, v)),
     [gl.FLOAT_VEC2]: (p, v) => gl.uniform2fv(p, v),
     [gl.FLOAT_VEC3]: (p, v) => gl.uniform3fv(p, v),
+    [gl.FLOAT_VEC4]: (p, v) => gl.uniform4fv(p, v),
     [gl.FLOAT_MAT4]: (p, v) => gl.uniformMatrix4fv(p, false, v),
   };
   for (const [name, value] of Object.entries(values)) {
@@ -75,6 +76,14 @@ export class Picture {
       };
     });
     this.walls = scene.atlas ? this.light(scene.atlas, data) : null;
+    if (scene.tint) {
+      gl.bindTexture(gl.TEXTURE_2D, gl.createTexture());
+      const map = gl.getParameter(gl.TEXTURE_BINDING_2D), colors = Uint8Array.from({ length: 1024 }, (_, k) => (k % 4 === 3 ? 255 : data[scene.tint.map + 3 * (k >> 2) + (k % 4)]));
+      gl.texStorage2D(gl.TEXTURE_2D, 1, gl.SRGB8_ALPHA8, 256, 1);
+      gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, 256, 1, gl.RGBA, gl.UNSIGNED_BYTE, colors);
+      for (const name of ["MIN_FILTER", "MAG_FILTER"]) gl.texParameteri(gl.TEXTURE_2D, gl[`TEXTURE_${name}`], gl.NEAREST);
+      this.tint = { map, values: this.volume(gl.R8, gl.RED, gl.UNSIGNED_BYTE, scene.tint.values.shape, fieldValues(data, scene.tint.values), gl.LINEAR) };
+    }
     this.size = [0, 0];
     if (scene.lights.length || scene.sky) Object.assign(this, { data, mixed: String([scene.lights.map((light) => light.weight), DEFAULTS.turn]) });
   }
@@ -154,7 +163,7 @@ export class Picture {
     gl.bindFramebuffer(gl.FRAMEBUFFER, into.frame);
     gl.enable(gl.DEPTH_TEST);
     gl.disable(gl.BLEND);
-    const translucent = state.look === "translucent" && !state.trust;
+    const translucent = this.through(state);
     const empty = translucent ? [0, 0, 0, 0] : [scene.background, scene.background, scene.background, 1];
     gl.clearColor(...empty);
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
@@ -170,11 +179,14 @@ export class Picture {
       "uHatch[0]": scene.trust.hatch.flat(),
       uPeel: front ? 1 : 0,
       uFront: this.bind(3, gl.TEXTURE_2D, front ? front.depth : null),
+      uClip: this.clip(state),
+      uTint: this.tint && state.tint ? 1 : 0,
+      ...(this.tint ? { uSecond: this.bind(4, gl.TEXTURE_3D, this.tint.values), uMap: this.bind(5, gl.TEXTURE_2D, this.tint.map), uToSecond: scene.tint.toTexture } : { uSecond: 4, uMap: 5 }),
     };
     gl.useProgram(this.fieldProgram.built);
     set(gl, this.fieldProgram, common);
     scene.fields.forEach((field, k) => {
-      set(gl, this.fieldProgram, { ...this.fieldTextures(k), ...this.fieldUniforms(field, k, state), uBothSides: translucent ? 1 : 0 });
+      set(gl, this.fieldProgram, { ...this.fieldTextures(k), ...this.fieldUniforms(field, k, state), uRough: field.rough ?? -1, uWindow: field.window });
       gl.drawArrays(gl.TRIANGLES, 0, 3);
     });
     gl.useProgram(this.wallProgram.built);
@@ -191,8 +203,11 @@ export class Picture {
     return { uField: this.bind(0, gl.TEXTURE_3D, values), uBricks: this.bind(1, gl.TEXTURE_3D, held), uLight: this.bind(2, gl.TEXTURE_3D, light) };
   }
 
-  fieldUniforms(field, k, { sweep }) {
+  fieldUniforms(field, k, { sweep, look, trust }) {
+    const films = !trust;
     return {
+      uThrough: films ? field.through : 0,
+      uBothSides: films && (look === "translucent" || field.through > 0) ? 1 : 0,
       uToIndex: field.toIndex,
       uToTexture: field.toTexture,
       uLevel: (this.level(field, sweep) - field.values.base) / field.values.step,
@@ -214,6 +229,18 @@ export class Picture {
       uAlbedo: wall.albedo, uEmission: wall.emission, uLocalColor: wall.localColor, uGround: wall.fades ? this.scene.background : -1,
       uGrey: atlas.channels === 1 ? 1 : 0,
     };
+  }
+
+  // Whether surfaces are seen through.
+  through({ look, trust }) {
+    return !trust && (look === "translucent" || this.scene.fields.some((field) => field.through > 0));
+  }
+
+  // The clip plane on the stage: of the axes x, y, z, then those from the other side, at a place from 0 to 1.
+  clip({ clip: [axis, at] }) {
+    if (axis < 0) return [0, 0, 0, 1];
+    const { low, high } = this.scene.clip, k = axis % 3, sign = axis < 3 ? 1 : -1;
+    return [0, 1, 2].map((j) => (j === k ? sign : 0)).concat(sign * ((1 - at) * low[k] + at * high[k]));
   }
 
   // Isovalue of a field at this place of the sweep, upwards.
@@ -255,7 +282,7 @@ export class Picture {
     const seen = { ...this.seen(state, width, height, place), uRaw: raw ? 1 : 0 };
     let drawn = this.layers[0];
     this.layer(drawn, null, seen, state);
-    if (state.look === "translucent" && !state.trust) {
+    if (this.through(state)) {
       const under = () => gl.blendFunc(gl.ONE_MINUS_DST_ALPHA, gl.ONE);
       gl.bindFramebuffer(gl.FRAMEBUFFER, this.sum.frame);
       gl.clearColor(0, 0, 0, 0);

@@ -2,7 +2,7 @@
 // light that is stored there, so that few suffice; until there are enough, the picture is mostly that of the lookup.
 
 import { dot, eyeOf, facing, sum } from "./camera.js";
-import { program, set } from "./picture.js";
+import { LOOKS, program, set } from "./picture.js";
 import { skyTurned } from "./skies.js";
 
 export const PLACES = [[0.25, 0.25], [0.75, 0.75], [0.75, 0.25], [0.25, 0.75]].concat( // within the pixel, as in a still picture of the package, then between
@@ -13,7 +13,8 @@ const FINE = 1 / 500; // standard error, in display radiance, at which the pictu
 const TRIAL = [96, 72], RAYS = 8; // pixels, and rays from each in either half of a trial
 const ENOUGH = 64; // pixels on which a surface is judged by itself
 const BAND = 30; // milliseconds for a part of a slow picture
-const OPEN = 0, DISC = 1, LAMP = 2;
+const OPEN = 0, DISC = 1, LAMP = 2, MIRROR = 3;
+const SHINY = 0.35; // roughness of the shiny look
 
 export class Resting {
   // Null where the page cannot: light that it holds no description of, or a graphics card without single precision.
@@ -44,7 +45,8 @@ export class Resting {
       origin: picture.target(width, height, true, [single, single, gl.RGBA16F]),
       ray: picture.target(width, height, true),
       found: picture.target(width, height, false),
-      means: [picture.target(width, height, false, [single]), picture.target(width, height, false, [single])],
+      mirror: picture.target(width, height, false),
+      means: [0, 1].map(() => picture.target(width, height, false, [single, single])),
     };
   }
 
@@ -52,11 +54,11 @@ export class Resting {
   begin(state, width, height, took) {
     const { picture } = this, size = String([width, height]);
     if (this.size !== size) {
-      if (this.whole) [this.whole.origin, this.whole.ray, this.whole.found, ...this.whole.means, this.raw].forEach((old) => picture.drop(old));
+      if (this.whole) [this.whole.origin, this.whole.ray, this.whole.found, this.whole.mirror, ...this.whole.means, this.raw].forEach((old) => picture.drop(old));
       Object.assign(this, { size, whole: this.targets(width, height), raw: picture.target(width, height, false), key: "" });
     }
     PLACES.slice(0, 4).forEach((place, k) => picture.sample(state, width, height, place, k, this.raw));
-    const key = JSON.stringify([size, state.view, state.sweep, state.weights, state.turn]);
+    const key = JSON.stringify([size, state.view, state.sweep, state.weights, state.turn, state.look, state.clip]);
     if (key === this.key) return;
     this.key = key;
     this.bands = Array(Math.max(1, Math.min(32, Math.ceil((3 * took) / BAND)))).fill(0);
@@ -100,7 +102,7 @@ export class Resting {
       this.scissor(band);
       set(gl, this.programs.show, {
         uStill: picture.bind(0, gl.TEXTURE_2D, picture.mean.color), uLinear: picture.bind(1, gl.TEXTURE_2D, this.raw.color),
-        uMean: picture.bind(2, gl.TEXTURE_2D, this.whole.means[rays % 2].color),
+        uMean: picture.bind(2, gl.TEXTURE_2D, this.whole.means[rays % 2].color), uCoat: picture.bind(3, gl.TEXTURE_2D, this.whole.means[rays % 2].colors[1]),
         uRays: rays, uWhite: this.scene.white, uGain: 2 ** stops, uForward: [0, 0, 1], uRight: [1, 0, 0], uUp: [0, 1, 0],
       });
       gl.drawArrays(gl.TRIANGLES, 0, 3);
@@ -141,16 +143,26 @@ export class Resting {
   }
 
   // Lights that rays ask for one by one, at their weights.
-  aims({ weights }) {
-    const weighed = ({ light, color }) => color.map((x) => x * (light < 0 ? 1 : weights[light]));
+  aims(state) {
+    const weighed = ({ light, color }) => color.map((x) => x * (light < 0 ? 1 : state.weights[light]));
+    const discs = this.scene.resting.discs.slice(0, 8);
+    const mirror = { uAim: MIRROR, "uDiscs[0]": discs.flatMap((d) => [...d.axis, d.cosine]), "uDiscShine[0]": discs.flatMap(weighed) };
+    if (!discs.length) Object.assign(mirror, { "uDiscs[0]": [0, 0, 0, 2], "uDiscShine[0]": [0, 0, 0] });
+    for (let k = Math.max(1, discs.length); k < 8; k++) mirror["uDiscs[0]"].push(0, 0, 0, 2);
     return [
       { uAim: OPEN },
+      ...(this.coats(state).some((rough) => rough >= 0) ? [mirror] : []),
       ...this.scene.resting.discs.map((disc) => ({ uAim: DISC, uAxis: disc.axis, uCosine: disc.cosine, uShine: weighed(disc) })),
       ...this.scene.resting.lamps.map((lamp) => {
         const wall = this.scene.walls[lamp.wall];
         return { uAim: LAMP, uLamp0: wall.corner, uLampU: wall.edgeU, uLampV: wall.edgeV, uLampNormal: wall.normal, uShine: weighed(lamp) };
       }),
     ];
+  }
+
+  // Roughness of each surface's coat, -1 without.
+  coats({ look }) {
+    return [...Array(16).keys()].map((k) => (k >= this.scene.fields.length ? -1 : (this.scene.fields[k].rough ?? (look === "shiny" ? SHINY : -1))));
   }
 
   sky({ weights, turn }) {
@@ -165,7 +177,8 @@ export class Resting {
   gather(into, state, count, place, isTrial, first = 0) {
     const { gl, picture, scene, programs } = this, { width, height } = into;
     gl.viewport(0, 0, width, height);
-    const seen = picture.seen(state, width, height, place);
+    const seen = { ...picture.seen(state, width, height, place), uRoll: ((first + count) * 0.7548776662466927) % 1, uLook: LOOKS.indexOf(state.look), uClip: picture.clip(state) };
+    const coats = { "uCoats[0]": this.coats(state), uEyeAt: seen.uEye };
     const fields = scene.fields.map((field, k) => ({ ...picture.fieldUniforms(field, k, state), uId: k }));
     const walls = scene.walls.map((wall, k) => ({ ...picture.wallUniforms(wall, state), uId: scene.fields.length + k }));
     const draw = (made, uniforms, kind = gl.TRIANGLES, vertices = 3) => {
@@ -185,10 +198,11 @@ export class Resting {
     walls.forEach((own, k) => {
       if (dot(own.uNormal, sum([1, seen.uEye], [-1, own.uCorner])) > 0) draw(programs.originWall, { ...seen, ...own, ...picture.wallTextures() }, gl.TRIANGLE_STRIP, 4);
     });
+    clear(into.mirror, false, 0);
     clear(into.found, false, 0);
     const number = first + count, flat = { uForward: [0, 0, 1], uRight: [1, 0, 0], uUp: [0, 1, 0], uJitter: [0, 0] };
     for (const aim of this.aims(state)) {
-      const ray = { ...flat, ...aim, uTurn: [0.7548776662466927, 0.5698402909980532].map((x) => (0.5 + number * x) % 1) };
+      const ray = { ...flat, ...aim, ...coats, uRoll: seen.uRoll, uLook: 0, uTurn: [0.7548776662466927, 0.5698402909980532].map((x) => (0.5 + number * x) % 1) };
       const origins = () => ({ uPlace: picture.bind(3, gl.TEXTURE_2D, into.origin.colors[0]), uNormals: picture.bind(4, gl.TEXTURE_2D, into.origin.colors[1]) });
       clear(into.ray, true, 0);
       gl.depthFunc(gl.LEQUAL);
@@ -196,13 +210,14 @@ export class Resting {
       gl.depthFunc(gl.LESS);
       fields.forEach((own, k) => draw(programs.field, { ...ray, ...own, ...picture.fieldTextures(k), ...origins() }));
       walls.forEach((own) => draw(programs.wall, { ...ray, ...own, ...picture.wallTextures(), ...origins() }));
-      picture.copy(into.ray, into.found.frame, () => gl.blendFunc(gl.ONE, gl.ONE));
+      picture.copy(into.ray, (aim.uAim === MIRROR ? into.mirror : into.found).frame, () => gl.blendFunc(gl.ONE, gl.ONE));
     }
     gl.bindFramebuffer(gl.FRAMEBUFFER, into.means[(count + 1) % 2].frame);
     gl.disable(gl.BLEND);
     const bound = (unit, texture) => picture.bind(unit, gl.TEXTURE_2D, texture);
     draw(programs.blend, {
-      ...flat,
+      ...flat, ...coats, "uOpaque[0]": [...scene.fields.map((field) => 1 - field.through), 1],
+      uOldCoat: bound(5, into.means[count % 2].colors[1]), uMirror: bound(6, into.mirror.color),
       uOld: bound(0, into.means[count % 2].color), uFound: bound(1, into.found.color), uKnown: bound(2, into.origin.colors[2]),
       uPlace: bound(3, into.origin.colors[0]), uNormals: bound(4, into.origin.colors[1]),
       uShare: 1 / (count + 1), uTrial: isTrial ? 1 : 0, "uTrust[0]": this.trust ?? [0], "uAlbedos[0]": this.surfaces.flatMap((s) => s.albedo),

@@ -10,7 +10,7 @@ uniform vec2 uTrust;                 // relative errors at the ends of the scale
 uniform vec3 uScale[5], uHatch[2];   // its colours, in equal steps of the logarithm, and those of holes
 uniform vec3 uLamp;                  // direction to the lamp of the shiny look, beside the eye
 
-uniform bool uRaw;                   // no tone curve
+uniform bool uRaw;                   // no tone curve, and no coats
 uniform float uGround;               // display radiance of the background, into which a floor under the sky fades; else below 0
 
 layout(location = 0) out vec4 color_;

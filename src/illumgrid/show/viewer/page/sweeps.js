@@ -70,9 +70,16 @@ function sweep(field, number, many, put) {
   return { box, show };
 }
 
+// A field whose level does not sweep.
+function fixed(field) {
+  const dot = element("i");
+  dot.style.background = field.swatch;
+  return { box: element("div", { class: "sweep" }, [element("div", { class: "head" }, [element("label", {}, [dot, `${field.name}, held at ${Number(field.sweep[0].toPrecision(4))}`])])]), show: () => {} };
+}
+
 // Fills `place`; returns a function that shows a share (0 to 1) of the common sweep on all sliders.
 export function sweeps(place, fields, put) {
-  const made = fields.map((field, k) => sweep(field, k, fields.length > 1, put));
+  const made = fields.map((field, k) => (field.sweep[0] === field.sweep[1] ? fixed(field) : sweep(field, k, fields.length > 1, put)));
   place.replaceChildren(...made.map((m) => m.box));
   return (share) => made.forEach((m) => m.show(share));
 }

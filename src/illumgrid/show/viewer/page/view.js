@@ -6,7 +6,7 @@ import { lights } from "./lights.js";
 import { LOOKS, Picture } from "./picture.js";
 import { PLACES, Resting } from "./resting.js";
 import { skyBall } from "./skies.js";
-import { DEFAULTS, clamp, isovalueOf, read, written } from "./state.js";
+import { AXES, DEFAULTS, clamp, isovalueOf, lead, read, written } from "./state.js";
 import { formatted, sweeps } from "./sweeps.js";
 
 const REST = 160; // milliseconds without a change until a full frame is drawn
@@ -40,6 +40,13 @@ export function view(root, scene, data, shaders, { address = true, onChange = ()
       for (const input of choice.querySelectorAll("input")) input.checked = input.value === state[kind];
     }
     part("effect").hidden = state.look === "matte";
+    const [axis, at] = state.clip, { low, high, middle, size } = scene.clip, cut = middle[axis % 3] + size * ((1 - at) * low[axis % 3] + at * high[axis % 3]);
+    part("clip").value = axis;
+    part("clipLine").hidden = part("clipNote").hidden = axis < 0;
+    part("clipPlace").value = at;
+    part("clipShown").value = axis < 0 ? "" : cut.toPrecision(4);
+    part("tint").checked = state.tint;
+    part("colors").hidden = !scene.tint;
     part("stops").value = state.stops;
     part("stopsShown").value = `${state.stops > 0 ? "+" : state.stops < 0 ? "\u2212" : "\u00b1"}${Math.abs(state.stops).toFixed(1)} EV`;
     part("trust").checked = state.trust;
@@ -120,7 +127,7 @@ export function view(root, scene, data, shaders, { address = true, onChange = ()
   }
 
   function still() {
-    rests = resting && state.rest && state.light === "global" && state.look === "matte" && !state.trust;
+    rests = resting && state.rest && state.light === "global" && !state.trust && !(scene.tint && state.tint);
     part("rays").value = "";
     if (rests) {
       resting.begin(state, canvas.width, canvas.height, view_.took);
@@ -144,7 +151,7 @@ export function view(root, scene, data, shaders, { address = true, onChange = ()
     canvas.toBlob((blob) => {
       const link = document.createElement("a");
       link.href = URL.createObjectURL(blob);
-      const isovalue = formatted(scene.fields[0], isovalueOf(scene.fields[0], state.sweep));
+      const isovalue = formatted(lead(scene), isovalueOf(lead(scene), state.sweep));
       link.download = `${scene.fields.map((f) => f.name).join("-").replace(/[^\p{L}\p{N}.-]+/gu, "_")}-${isovalue}.png`;
       link.click();
       setTimeout(() => URL.revokeObjectURL(link.href), 1000);
@@ -159,6 +166,17 @@ export function view(root, scene, data, shaders, { address = true, onChange = ()
   }
   part("stops").addEventListener("input", () => put({ stops: Number(part("stops").value) }));
   part("trust").addEventListener("change", () => put({ trust: part("trust").checked }));
+  for (const name of ["clip", "clipPlace"]) {
+    part(name).addEventListener("input", () => put({ clip: [Number(part("clip").value), Number(part("clipPlace").value)] }));
+  }
+  part("clip").replaceChildren(new Option("nothing", -1), ...AXES.map((axis, k) => new Option(`${axis.length > 1 ? "before" : "beyond"} ${axis.at(-1)}`, k)));
+  if (scene.fields.some((field) => field.through > 0 || (field.rough ?? -1) >= 0)) part("own").textContent = "Own";
+  if (scene.tint) {
+    part("tintName").textContent = scene.tint.name;
+    scene.tint.ends.forEach((end, k) => (part(k ? "tintMost" : "tintLeast").textContent = Number(end.toPrecision(4))));
+    part("tintScale").style.background = `linear-gradient(90deg, ${scene.tint.colors.join(", ")})`;
+    part("tint").addEventListener("change", () => put({ tint: part("tint").checked }));
+  }
   part("rest").addEventListener("change", () => put({ rest: part("rest").checked }));
   part("reset").addEventListener("click", reset);
   part("save").addEventListener("click", save);

@@ -1,7 +1,7 @@
 // The same view in a notebook: the traits of the anywidget model follow the view, and set it.
 
 import { inflate } from "./numbers.js";
-import { isovalueOf, sweepOf } from "./state.js";
+import { isovalueOf, lead, sweepOf } from "./state.js";
 import { complain, view } from "./view.js";
 
 async function render({ model, el }) {
@@ -13,8 +13,8 @@ async function render({ model, el }) {
   try {
     const scene = JSON.parse(model.get("_scene")), held = model.get("_data");
     const data = await inflate(new Uint8Array(held.buffer, held.byteOffset, held.byteLength));
-    const [low, high] = scene.fields[0].range;
-    const isovalue = (sweep) => isovalueOf(scene.fields[0], sweep);
+    const [low, high] = lead(scene).range;
+    const isovalue = (sweep) => isovalueOf(lead(scene), sweep);
     const given = () => scene.lights.map(({ name, weight }) => model.get("weights")[name] ?? weight);
     const near = (a, b) => Math.abs(a - b) < 1e-9 * (high - low);
     const agree = (state) => near(model.get("isovalue"), isovalue(state.sweep)) && String(given()) === String(state.weights);
@@ -28,7 +28,7 @@ async function render({ model, el }) {
       },
     });
     const follow = () => {
-      if (!agree(shown.state)) shown.put({ sweep: sweepOf(scene.fields[0], model.get("isovalue")), weights: given() });
+      if (!agree(shown.state)) shown.put({ sweep: sweepOf(lead(scene), model.get("isovalue")), weights: given() });
     };
     for (const trait of ["isovalue", "weights"]) model.on(`change:${trait}`, follow);
     follow();
