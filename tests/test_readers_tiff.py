@@ -119,6 +119,14 @@ def test_a_folder_of_slices(tmp_path):
     refused(tmp_path, "s11.tif is no single grey slice")
 
 
+def test_pixels_of_imagej_without_a_size_are_1_as_there_and_a_warning_says_so(tmp_path):
+    about = {"axes": "ZYX", "spacing": 2, "unit": "um"}
+    tifffile.imwrite(tmp_path / "a.tif", ZYX.astype("uint16"), imagej=True, resolution=(0, 0), metadata=about)
+    with pytest.warns(IllumgridWarning, match="does not say how large its pixels are; 1 was taken"):
+        volume = read_volume(tmp_path / "a.tif")
+    assert volume.spacing.tolist() == [1, 1, 2] and volume.unit == "µm"
+
+
 @pytest.mark.filterwarnings("ignore:spacing")
 def test_a_part_of_a_folder_of_slices(tmp_path):
     for k in range(7):

@@ -44,7 +44,11 @@ def calibrated(tiff: Any, series: int) -> Found:
         depth = float(about.get("spacing") or math.nan)
         if unit is None and "spacing" not in about:
             return _by_resolution(tiff, x, y)
-        return _checked([x or 1.0, y or 1.0, abs(depth)], unit)
+        found, unit, notes = _checked([x or 1.0, y or 1.0, abs(depth)], unit)
+        if not (x and y):
+            text = "does not say how large its pixels are; 1 was taken, as ImageJ does; give --spacing"
+            notes = (*notes, ("spacing", text))
+        return found, unit, notes
     return _by_resolution(tiff, x, y)
 
 
