@@ -97,6 +97,7 @@ REFUSED = {
     ("run", "--ignore"): NAMES,
     ("run", "--no-embed"): FLAG,
     ("run", "--resume"): FLAG,
+    ("run", "--lazy"): FLAG,
     ("run", "--any-machine"): FLAG,
     ("run", "--workers"): [*WORDS, "-1", "0"],
     ("run", "--dask"): ["", "nonsense", "☃"],

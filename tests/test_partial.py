@@ -31,7 +31,7 @@ def pieces(monkeypatch):
     monkeypatch.setattr(walk, "GROWTH", 1.0)
     monkeypatch.setattr(partial, "EVERY", 0.0)
     monkeypatch.setattr(partial, "CHUNK", 64)
-    monkeypatch.setattr(sys.modules["illumgrid.cli.run"], "judged_light", lambda light, stages, folder: light)
+    monkeypatch.setattr(sys.modules["illumgrid.cli.outcome"], "judged_light", lambda light, stages, folder: light)
     real = walk.answer
     asked = []
 

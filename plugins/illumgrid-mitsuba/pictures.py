@@ -17,11 +17,11 @@ from illumgrid.show import fit_camera, render, widest_row
 MEDIUM = '{"type": "homogeneous", "albedo": {"type": "rgb", "value": [0.995, 0.97, 0.9]}, "sigma_t": 12.0}'
 SOLIDS = {
     # albedo, backend, texels along the floor, paths, bounces
-    "glass": ((0.9, 0.9, 0.9), Mitsuba(bsdf='{"type": "dielectric", "int_ior": 1.5}'), 216, 384, 8),
-    "wax": ((0.9, 0.75, 0.55), Mitsuba(medium=MEDIUM), 108, 128, 32),
+    "glass": ((0.9, 0.9, 0.9), Mitsuba(bsdf='{"type": "dielectric", "int_ior": 1.5}'), 180, 1280, 8),
+    "wax": ((0.9, 0.75, 0.55), Mitsuba(medium=MEDIUM), 108, 640, 32),
 }
-ROWS = 7
-"""Of the sweep; every second one is drawn, so that the floor is that of the row and not between two."""
+ROWS = 4
+"""Of the sweep, and pictures: each shows the floor of its own row, and no mixture of two."""
 
 
 def blobs(size=64):
@@ -40,9 +40,9 @@ def stage(albedo, texels):
     down = np.array([0.1, -0.1, 0.0]) - at
     down /= np.linalg.norm(down)
     u = np.cross(down, [0, 0, 1])
-    u *= 0.7 / np.linalg.norm(u)
+    u *= 0.9 / np.linalg.norm(u)
     v = np.cross(down, u)
-    lamp = ig.Quad("lamp", at - (u + v) / 2, u, v, ig.Material((0, 0, 0), (40, 40, 40)), texels=(2, 2))
+    lamp = ig.Quad("lamp", at - (u + v) / 2, u, v, ig.Material((0, 0, 0), (24, 24, 24)), texels=(2, 2))
     solid = ig.Field("solid", blobs(), ig.Material(albedo), (0.25, 0.67))
     return ig.Scene((solid,), (floor, lamp), (0.12, 0.13, 0.15))
 
@@ -58,8 +58,8 @@ def main():
         light = ig.run(scene, sampler=sampler, backend=backend, interpolator="splat", judge=False, **how)
         camera = fit_camera(scene, widest_row(scene), 1.0, (20.0, 50.0), 0.62)
         camera = replace(camera, eye=camera.eye - 0.42 * camera.up + 0.1 * camera.right)
-        shown = np.linspace(*scene.fields[0].range, ROWS)[::2]
-        row = [render(light, isovalue=c, width=480, height=480, camera=camera) for c in shown]
+        shown = np.linspace(*scene.fields[0].range, ROWS)
+        row = [render(light, isovalue=c, width=480, height=480, camera=camera, stops=-0.4) for c in shown]
         whole = np.concatenate([np.asarray(p)[..., :3] for p in row], axis=1)
         Image.fromarray(whole).save(Path(sys.argv[1]) / f"{name}.png", optimize=True)
 

@@ -25,11 +25,11 @@ from illumgrid.field.lattice import specs_over
 from illumgrid.field.layers import layers_of
 from illumgrid.field.scene import Scene, level_table
 from illumgrid.io import needs, store
-from illumgrid.io.partial import Partial
 from illumgrid.light import Illumination
 from illumgrid.stages import Backend, Interpolator, Sampler
 from illumgrid.transport.stages import capabilities
 from illumgrid.transport.tracer import Tracer, prepare
+from illumgrid.transport.walk import RunKeeper
 
 MANY_BOUNCES = 4
 """More reflections than these, and a coarse grid pays that is lit first: paths are long, and most of them end there."""
@@ -67,7 +67,7 @@ def run(
     judge: bool = True,
     map: Map = map,
     progress: Progress = lambda what, done, total: None,
-    keep: Partial | None = None,
+    keep: RunKeeper | None = None,
 ) -> Illumination:
     """Light a scene: one illumination grid for each field.
 
@@ -100,7 +100,7 @@ def run(
         What spreads the work: see `illumgrid.bake.bake`.
     progress : callable, optional
         Called with (what, done, total).
-    keep : Partial, optional
+    keep : RunKeeper, optional
         Keeps the light that is finished; what the run that it goes on with had chosen is taken over.
 
     Returns
@@ -149,7 +149,8 @@ def run(
     needs.check_run(scene, specs, levels, getattr(chosen[2], "density", 1.0))
     if bounces is None:
         bounces, left_out = enough_bounces(scene, tracer, seed)
-        cached = bounces > MANY_BOUNCES and capabilities(chosen[1]).surface == "levelset" and hasattr(tracer, "cache")
+        cached = bounces > MANY_BOUNCES and not (keep and keep.at_once)
+        cached = cached and capabilities(chosen[1]).surface == "levelset" and hasattr(tracer, "cache")
     elif not before:
         left_out = light_left_out(scene, tracer, bounces, seed)
     clock, gathering = time.perf_counter(), tracer

@@ -124,10 +124,9 @@ def bake(
     del nodes, texels
     clock.append(time.perf_counter())
     ranks = None if keep is None else [coarse_first(scene, specs, levels, batch) for batch in state.targets]
-    if keep is not None and ranks:
-        keep.begin(state.targets, in_order(ranks))
+    choose = keep.begin(state.targets, in_order(ranks)) if keep is not None and ranks else None
     for numbers in paths:
-        state = state.walk(tracer, numbers, map, progress, keep, ranks)
+        state = state.walk(tracer, numbers, map, progress, keep, ranks, choose)
     if keep is not None and state.answers:
         keep.end(state.answers)
     del ranks

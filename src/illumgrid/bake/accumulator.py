@@ -12,7 +12,7 @@ from illumgrid.errors import BadInput
 from illumgrid.grid.channels import Channels
 from illumgrid.transport.samples import Queries, Samples, combine, join_queries, join_samples
 from illumgrid.transport.tracer import Tracer, answered
-from illumgrid.transport.walk import Keeper, Ranks, Walk, answer, split
+from illumgrid.transport.walk import AT_ONCE, Chooser, Keeper, Ranks, Walk, answer, split
 
 Progress = Callable[[str, int, int], None]
 """Called with what is being done, how much of it is done, and how much there is."""
@@ -79,10 +79,15 @@ class Bake:
         progress: Progress = lambda what, done, total: None,
         keep: Keeper | None = None,
         ranks: Ranks | None = None,
+        choose: Chooser | None = None,
     ) -> "Bake":
-        """Walk the paths with these numbers from every target as well; see `bake` for the others."""
+        """Walk the paths with these numbers from every target as well; see `bake` for the others.
+
+        In the order of `ranks`; or, with a `map` that takes one piece after the other, as is chosen then.
+        """
         ranges = [range(n * paths.start, n * paths.stop) for n in self.weights]
         going = Walk(self.targets, ranges, split(keep.known(paths) if keep else None, self.targets))
+        going.seconds = AT_ONCE if choose else going.seconds
         first = np.cumsum([0, *map(len, self.targets)])
         total, within = int(first[-1]), 0
         what = "more light" if self.answers else "light"
@@ -96,7 +101,8 @@ class Bake:
         progress(what, done, total)
         before = answered.set(tick)
         try:
-            for found in map(partial(answer, tracer, self.bounces, self.seed), going.pieces(ranks)):
+            pieces = going.wanted(choose) if choose else going.pieces(ranks)
+            for found in map(partial(answer, tracer, self.bounces, self.seed), pieces):
                 number, rows = going.take(found)
                 if keep:
                     keep.keep(first[number] + rows, found)

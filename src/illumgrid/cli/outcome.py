@@ -3,6 +3,7 @@
 import shlex
 import sys
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from shutil import rmtree
 from tempfile import gettempdir, mkdtemp
@@ -13,6 +14,7 @@ from illumgrid.errors import tell
 
 if TYPE_CHECKING:
     from illumgrid.io.elsewhere import Source
+    from illumgrid.io.partial import Partial
     from illumgrid.light import Illumination
 
 
@@ -32,6 +34,21 @@ def save(light: "Illumination", folder: Path, preview: bool, overwrite: bool, so
                 say(f"the light is kept in {work / folder.name}; move that folder to where you want it")
                 break
         raise
+
+
+def finished(
+    light: "Illumination", folder: Path, keep: "Partial", stages: dict[str, Any], sentences: list[str],
+    preview: bool = True, overwrite: bool = False, source: "Source | None" = None,
+) -> "Illumination":  # fmt: skip
+    """Save the light of a run in place of what was kept on the way; then measure its error."""
+    from illumgrid.io import store
+
+    save(replace(light, recipe={**light.recipe, "warnings": sentences}), folder, preview, overwrite, source)
+    keep.leave(folder)
+    light = judged_light(light, stages, folder)
+    about = {key: light.recipe[key] for key in ("reached", "reached_uncertain", "reached_on_walls")}
+    store.amend(folder, {**about, "warnings": sentences})
+    return light
 
 
 def judged_light(light: "Illumination", stages: dict[str, Any], folder: Path) -> "Illumination":

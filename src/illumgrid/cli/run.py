@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from illumgrid.cli.long import check_spread, kept, shared_out, spread
-from illumgrid.cli.outcome import again, judged_light, report, save
-from illumgrid.cli.reading import NONE, with_reading
+from illumgrid.cli.outcome import again, finished, report
+from illumgrid.cli.reading import NONE, given, with_reading
 from illumgrid.cli.scenes import in_harmonics, scene_input
 from illumgrid.cli.terminal import Ignore, progress_bars, reported_warnings, say
 from illumgrid.errors import BadInput, shown_range, tell
@@ -146,6 +146,10 @@ def run(
     dask: Annotated[
         str | None, typer.Option(metavar="ADDRESS", help="The workers of a dask scheduler, such as tcp://host:8786.")
     ] = None,
+    lazy: Annotated[
+        bool,
+        typer.Option("--lazy", help="Open a page with coarse light at once; light what one looks at, as one looks."),
+    ] = False,
     any_machine: Annotated[
         bool,
         typer.Option(
@@ -162,6 +166,7 @@ def run(
     A long run keeps what it has finished in DIR.partial: after a stop the same command goes on from there.
     """
     from illumgrid.chain import run as light_up
+    from illumgrid.cli.lazily import look
     from illumgrid.field.diagnosis import diagnose
     from illumgrid.field.lattice import nodes_over
     from illumgrid.field.scene import with_texels
@@ -169,6 +174,10 @@ def run(
 
     with reported_warnings(ignore) as sentences:
         check_spread(workers, dask)
+        if lazy and (
+            extra := given(error=error, seconds=seconds, workers=workers, dask=dask, no_embed=no_embed or None)
+        ):
+            raise BadInput(f"--lazy came with --{next(iter(extra)).replace('_', '-')}; expected one of them")
         names = {"sampler": sampler, "backend": backend, "interpolator": interpolator}
         stages = _stages(names, settings or [], {"backend.threads": threads, "sampler.count": isovalues})
         asked = scene_input(source, surroundings, limits, inside, signed, albedo, reading)
@@ -195,6 +204,10 @@ def run(
         if keep is None:
             say(f"{folder} is finished, and holds as many paths: nothing is left to do")
             return
+        about = {"input": asked.name if source is None else source, "reading": reading, "smooth": smooth or 0.0}
+        if lazy:
+            look(scene, stages, keep, numbers, about, folder, sentences)
+            return
         for field in scene.fields:
             shape = " x ".join(map(str, field.volume.shape))
             say(f"{field.name}: {shape} voxels, isovalues {shown_range(field.range)}")
@@ -209,14 +222,9 @@ def run(
                 scene, **shared_out(stages, workers), **numbers, error=error, seconds=seconds, judge=False,
                 map=over, progress=progress, keep=keep,
             )  # fmt: skip
-        about = {"input": asked.name if source is None else source, "reading": reading, "smooth": smooth or 0.0}
-        light = replace(light, recipe={**light.recipe, **about, "warnings": sentences})
+        light = replace(light, recipe={**light.recipe, **about})
         elsewhere = asked.source(smooth or 0.0) if no_embed and asked.source else None
-        save(light, folder, not no_preview, overwrite or resume, elsewhere)
-        keep.leave(folder)
-        light = judged_light(light, stages, folder)
-        about = {key: light.recipe[key] for key in ("reached", "reached_uncertain", "reached_on_walls")}
-        store.amend(folder, {**about, "warnings": sentences})
+        light = finished(light, folder, keep, stages, sentences, not no_preview, overwrite or resume, elsewhere)
     report(light, folder, picture=not no_preview)
 
 

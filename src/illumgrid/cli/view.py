@@ -9,12 +9,19 @@ import typer
 from illumgrid.cli.lights import SkyImage, Turn, Weights, relit
 from illumgrid.cli.long import loaded
 from illumgrid.cli.looks import Color, ColorMap, ColorRange, Look, looking, tint_of
+from illumgrid.cli.reading import given
 from illumgrid.cli.terminal import say
 from illumgrid.errors import BadInput
 
 
 def view(
-    folder: Annotated[Path, typer.Argument(metavar="DIR", help="A finished run.")],
+    folder: Annotated[
+        Path,
+        typer.Argument(
+            metavar="DIR|INPUT",
+            help="A run, finished or not; or what run takes, to be lit in INPUT-light while one looks.",
+        ),
+    ],
     export: Annotated[
         Path | None, typer.Option("--export", metavar="HTML", help="Write the page as one file instead of serving it.")
     ] = None,
@@ -41,6 +48,21 @@ def view(
         raise BadInput(f"--export is {export.name!r}; expected a file name that ends in .html")
     if desktop and (export is not None or no_open):
         raise BadInput("--desktop came with --export or --no-open; expected it without them")
+    otherwise = given(weights=weights, sky=sky, turn=turn or None, look=look, color=color)
+    if export is None and not desktop and not otherwise:
+        from illumgrid import unfinished
+        from illumgrid.cli import lazily
+        from illumgrid.field.builtin import SCENES
+
+        place = unfinished.place_of(folder)
+        if place is not None and lazily.go_on(place, not no_open, up):
+            return
+        if place is None and (folder.is_file() or (str(folder) in SCENES and not folder.exists())):
+            finished = lazily.look_at(str(folder), not no_open, up)
+            if finished is None:
+                return
+            folder = finished
+            say(f"{folder} is finished")
     light = looking(relit(loaded(folder), weights, sky, turn), look)
     tint = tint_of(light, color, cmap, color_range)
     if desktop and (tint is not None or look):
@@ -62,10 +84,8 @@ def view(
     with serve(text) as server:
         say(f"serving {server.address} to this machine only; stop with Ctrl-C")
         if not no_open:
-            import threading
-            import webbrowser
+            from illumgrid.cli.lazily import browse
 
-            # In a thread: a browser that runs until its window closes would wait for a page that nobody serves.
-            threading.Thread(target=webbrowser.open, args=(server.address,), daemon=True).start()
+            browse(server.address)
         with suppress(KeyboardInterrupt):  # the normal end of a server: exit 0
             server.serve_forever()

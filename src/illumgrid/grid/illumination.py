@@ -192,6 +192,8 @@ class IlluminationGrid:
         the largest second derivative), which is taken along each axis from the values themselves, less their noise.
         """
         known = (self.support > 0) & np.isfinite(self.error)
+        if not known.any():
+            return np.full(known.shape, np.inf, np.float32)
         kept = np.where(self._alone, 8 / 27, 1.0)
         square = np.where(known, kept * np.square(self.error, where=known, out=np.zeros(known.shape)), np.inf)
         for axis in range(3):
@@ -208,7 +210,7 @@ class IlluminationGrid:
         Near 1 the light changes from node to node without a law, and `bar` is a lower bound. Infinite without bends.
         """
         near, far = 0.0, 0.0
-        for axis in range(3):
+        for axis in range(3) if np.isfinite(self.error).any() else ():
             if self.spec.shape[axis] > 4:
                 bends = (self._bend(axis, step) for step in (1, 2))
                 one, two = (bend[np.isfinite(bend)] for bend in bends)

@@ -85,17 +85,22 @@ def identity(scene: Scene, stages: Mapping[str, Any], **asked: float | None) -> 
     **asked
         Numbers that the user gave.
     """
-    from llvmlite.binding import get_host_cpu_name
-
     given: Record = dict(asked)
     for kind, stage in stages.items():
         options = {name: value for name, value in asdict(stage).items() if name != "threads"}  # which decide no light
         given |= {kind: {"name": stage.name, **options}}
-    given |= {"versions": {name: version(name) for name in ("illumgrid", "numba", "numpy", "scipy")}}
-    given |= {"processor": get_host_cpu_name()}
+    given |= machine()
     about = {f"field {field.name!r}": digest(field) for field in scene.fields}
     surroundings = {f.name: digest(getattr(scene, f.name)) for f in fields(scene) if f.name != "fields"}
     return dict(json.loads(json.dumps({**about, **surroundings, **given})))
+
+
+def machine() -> Record:
+    """What of an identity is of this machine: `MACHINE`."""
+    from llvmlite.binding import get_host_cpu_name
+
+    versions = {name: version(name) for name in ("illumgrid", "numba", "numpy", "scipy")}
+    return {"versions": versions, "processor": get_host_cpu_name()}
 
 
 def differences(one: Record, other: Record) -> list[str]:
@@ -123,6 +128,8 @@ class Partial:
     scene : callable, optional
         Writes the scene to a folder that does not exist yet.
     """
+
+    at_once = False
 
     def __init__(
         self, folder: Path, about: Record, command: str, scene: Callable[[Path], None] = lambda folder: None
@@ -236,6 +243,12 @@ class Partial:
         if time.monotonic() - self._last >= EVERY:
             self._write()
 
+    def settle(self) -> None:
+        """Write now that the run is on its way, however short it may be."""
+        if self._group is None:
+            with disk.sentences(f"{self.place} could not be written", "choose another folder"), disk.held():
+                self._create()
+
     def flush(self) -> None:
         """See `Keeper`."""
         if self._group is not None:
@@ -280,11 +293,14 @@ class Partial:
         part, rows = self._part(paths, some[0][1].channels), np.concatenate([r for r, _ in some])
         order = np.argsort(rows, kind="stable")
         rows = rows[order]
-        ends = [*np.flatnonzero(np.diff(rows, prepend=-2) != 1).tolist(), len(rows)]
+        cuts = [0, *(np.flatnonzero(np.diff(rows // CHUNK)) + 1).tolist(), len(rows)]
         for key, column in (("light", 0), ("spread", 1), ("paths", 2)):  # paths last: they make the others count
             values = np.concatenate([answer[column] for _, answer in some])[order]
-            for a, b in pairwise(ends):
-                part[key][rows[a] : rows[a] + b - a] = values[a:b]
+            for a, b in pairwise(cuts):  # each chunk once: its rows may come in any order
+                first = int(rows[a]) // CHUNK * CHUNK
+                chunk = part[key][first : first + CHUNK]
+                chunk[rows[a:b] - first] = values[a:b]
+                part[key][first : first + CHUNK] = chunk
             self._sync(part, key, rows)
         return len(rows)
 

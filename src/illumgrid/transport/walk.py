@@ -2,9 +2,9 @@
 
 import time
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,11 +17,18 @@ PIECE = 1 << 17
 """Paths in the first piece of work."""
 SECONDS = 2.0
 """That a piece should take: later ones are sized by the pace of those before."""
+AT_ONCE = 0.25
+"""The same where somebody looks on, and may look elsewhere before the next piece."""
 GROWTH = 4.0
 """How many times larger, or smaller, the next piece may be."""
 
 Ranks = Sequence[NDArray[np.integer]]
 """For each batch numbers (n,) by which its targets are walked from, lowest first."""
+
+
+Chooser = Callable[[NDArray[np.bool_], Sequence[int]], tuple[int, NDArray[np.int64]]]
+"""From what has no answer yet, of all rows, and how many targets of each batch make a piece: the batch of the next
+piece, and which of its targets, in their order."""
 
 
 class Keeper(Protocol):
@@ -30,8 +37,8 @@ class Keeper(Protocol):
     A row is the place of a target in all batches, one after the other.
     """
 
-    def begin(self, targets: Sequence[Queries], order: NDArray[np.int64]) -> None:
-        """Learn what is asked, and the rows in the order in which their answers will come."""
+    def begin(self, targets: Sequence[Queries], order: NDArray[np.int64]) -> Chooser | None:
+        """Learn what is asked, and the rows in the order in which their answers will come; or choose another order."""
 
     def known(self, paths: range) -> "Answer | None":
         """Answers of all rows, with paths -1 where none is known; None without any."""
@@ -44,6 +51,18 @@ class Keeper(Protocol):
 
     def end(self, answers: Sequence[Samples]) -> None:
         """Take the moments of all paths of all rows, in the end."""
+
+
+class RunKeeper(Keeper, Protocol):
+    """A keeper that takes down what a whole run chose."""
+
+    at_once: bool
+    """Whether the first answers are waited for: then no coarse grid is lit before, in which paths end."""
+    chosen: dict[str, Any] | None
+    """By the run that is gone on with."""
+
+    def choose(self, chosen: dict[str, Any]) -> None:
+        """Take down what was chosen, which a run that goes on takes over."""
 
 
 class Answer(NamedTuple):
@@ -77,11 +96,14 @@ class Walk:
         Numbers of the paths from each target of a batch.
     answers : list of Samples
         What is known already, one per batch, paths -1 where it is not; None for a batch without any.
+    seconds : float
+        That a piece should take.
     """
 
     targets: Sequence[Queries]
     ranges: Sequence[range]
     answers: list[Samples | None]
+    seconds: float = SECONDS
     size: float = field(default_factory=lambda: float(PIECE))
     asked: deque[tuple[int, NDArray[np.int64]]] = field(default_factory=deque)
 
@@ -97,11 +119,22 @@ class Walk:
                     self.asked.append((number, some))
                     yield queries[slice(None) if len(some) == len(queries) else some], paths
 
+    def wanted(self, choose: Chooser) -> Iterator[tuple[Queries, range]]:
+        """What is not known yet, each piece as it is chosen, once the one before is answered."""
+        while (unknown := self._unknown()).any():
+            number, rows = choose(unknown, [max(1, int(self.size / max(len(p), 1))) for p in self.ranges])
+            self.asked.append((number, rows))
+            yield self.targets[number][rows], self.ranges[number]
+
+    def _unknown(self) -> NDArray[np.bool_]:
+        each = (np.ones(len(q), bool) if a is None else a.paths < 0 for q, a in zip(self.targets, self.answers))
+        return np.concatenate([np.zeros(0, bool), *each])
+
     def take(self, found: Answer) -> tuple[int, NDArray[np.int64]]:
         """Put the answer to the piece that has waited longest in its place; returns the batch and the rows in it."""
         number, rows = self.asked.popleft()
         pace = len(rows) * len(self.ranges[number]) / max(found.seconds, 1e-3)
-        self.size = min(max(pace * SECONDS, self.size / GROWTH, 1.0), GROWTH * self.size)
+        self.size = min(max(pace * self.seconds, self.size / GROWTH, 1.0), GROWTH * self.size)
         queries, arrays = self.targets[number], found[:3]
         if len(rows) == len(queries):
             self.answers[number] = Samples(queries, *arrays, found.channels)

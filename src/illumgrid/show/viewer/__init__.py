@@ -28,6 +28,7 @@ MODULES = (
     "input",
     "picture",
     "resting",
+    "live",
     "view",
 )  # each imports from earlier
 SHADERS = (
@@ -43,9 +44,13 @@ def source(name: str) -> str:
     return (files("illumgrid.show.viewer") / "page" / name).read_text(encoding="utf-8")
 
 
-def script(last: str) -> str:
-    """The modules and `last` joined into one: names are unique, so imports and exports are dropped, as comments are."""
-    joined = "\n".join(source(f"{name}.js") for name in (*MODULES, last))
+def script(last: str, live: bool = False) -> str:
+    """The modules and `last` joined into one: names are unique, so imports and exports are dropped, as comments are.
+
+    The module that asks for news of light is in `live` pages only.
+    """
+    names = [name for name in MODULES if live or name != "live"]
+    joined = "\n".join(source(f"{name}.js") for name in (*names, last))
     joined = re.sub(r"^(import | *//).*\n", "", joined, flags=re.MULTILINE)
     return re.sub(r"^export (?!default)", "", joined, flags=re.MULTILINE)
 
@@ -55,23 +60,27 @@ def shaders() -> dict[str, str]:
     return {name: re.sub(r"^ +|^ *//.*\n| *//.*$", "", source(name), flags=re.MULTILINE) for name in SHADERS}
 
 
-def compressed(data: bytes) -> bytes:
+def compressed(data: bytes, level: int = 6) -> bytes:
     """The arrays in gzip, which the page unpacks; equal data give equal bytes."""
-    return gzip.compress(data, 6, mtime=0)
+    return gzip.compress(data, level, mtime=0)
 
 
 def _json(value: Any) -> str:
     return json.dumps(value, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
 
 
-def policy(text: str) -> str:
-    """What the page may do: run this one script, show pictures that it drew; no network, no frames, no forms."""
+def policy(text: str, live: bool = False) -> str:
+    """What the page may do: run this one script, show pictures that it drew; no network, no frames, no forms.
+
+    A page that is `live` may also ask the server that it came from.
+    """
     digest = base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
     allowed = f"script-src 'sha256-{digest}'; style-src 'unsafe-inline'; img-src data: blob:"
+    allowed += "; connect-src 'self'" if live else ""
     return f"default-src 'none'; {allowed}; base-uri 'none'; form-action 'none'"
 
 
-def page(light: Illumination, up: str | None = None, tint: "Tint | None" = None) -> str:
+def page(light: Illumination, up: str | None = None, tint: "Tint | None" = None, live: int = 0) -> str:
     """One HTML file that holds everything: it opens from disk and makes no network request.
 
     Parameters
@@ -81,6 +90,8 @@ def page(light: Illumination, up: str | None = None, tint: "Tint | None" = None)
         World direction that is up, as in `illumgrid.show.fit_camera`.
     tint : Tint, optional
         A second quantity that colours all fields.
+    live : int
+        Above 0 the page, which is made quickly, asks the server that it came from for light that is newer than this.
 
     Returns
     -------
@@ -90,14 +101,15 @@ def page(light: Illumination, up: str | None = None, tint: "Tint | None" = None)
     from illumgrid.show.viewer.packing import packed
 
     scene, data = packed(light, up, tint)
+    scene["live"] = live
     parts = {
         "title": html.escape(scene["title"]) + " · illumgrid",
         "style": source("view.css"),
         "markup": source("view.html"),
         "shaders": _json(shaders()),
         "scene": _json(scene),
-        "data": base64.b64encode(compressed(data)).decode(),
-        "script": script("page"),
+        "data": base64.b64encode(compressed(data, 1 if live else 6)).decode(),
+        "script": script("page", bool(live)),
     }
-    parts["policy"] = policy(f"\n{parts['script']}\n")
+    parts["policy"] = policy(f"\n{parts['script']}\n", bool(live))
     return re.sub(r"\{\{(\w+)\}\}", lambda found: parts[found[1]], source("page.html"))

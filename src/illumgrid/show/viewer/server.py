@@ -1,18 +1,23 @@
-"""Serve the page to this machine only, and only to requests that carry its token."""
+"""Serve the page to this machine only, and only to requests that carry its token; and news of light, if it is live."""
 
 import secrets
 import socket
 import sys
 import threading
+from collections.abc import Callable
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
+from urllib.parse import parse_qs
 
 CONNECTIONS = 32
 """At once; more are hung up on, so that descriptors and threads do not run out."""
 
 CHUNK = 1 << 16
 """Bytes that a slow reader has `_Answer.timeout` seconds for."""
+
+News = Callable[[dict[str, list[str]]], bytes]
+"""Answers what a live page asks, by the names in the address."""
 
 HEADERS = {
     "Content-Type": "text/html; charset=utf-8",
@@ -26,13 +31,13 @@ HEADERS = {
 
 
 class PageServer(ThreadingHTTPServer):
-    """One page at 127.0.0.1, on a free port, under a token that is drawn at each start."""
+    """One page at 127.0.0.1, on a free port, under a token drawn at each start; beneath it `news` at "light"."""
 
     daemon_threads = True
 
-    def __init__(self, page: bytes) -> None:
+    def __init__(self, page: bytes, news: News | None = None) -> None:
         super().__init__(("127.0.0.1", 0), _Answer)
-        self.page = page
+        self.page, self.news = page, news
         self.place = f"/{secrets.token_urlsafe(24)}/"
         self.free = threading.Semaphore(CONNECTIONS)
 
@@ -71,20 +76,27 @@ class _Answer(BaseHTTPRequestHandler):
         host = (self.headers.get("Host") or "").rpartition(":")[0]
         if host not in ("127.0.0.1", "localhost"):  # a foreign name that resolves to this machine (DNS rebinding)
             self.send_error(HTTPStatus.FORBIDDEN)
-        elif not secrets.compare_digest(self.path.partition("?")[0].encode(), self.server.place.encode()):
-            self.send_error(HTTPStatus.NOT_FOUND)
+            return
+        place, _, asked = self.path.partition("?")
+        if secrets.compare_digest(place.encode(), self.server.place.encode()):
+            self._send(self.server.page, {})
+        elif self.server.news and secrets.compare_digest(place.encode(), f"{self.server.place}light".encode()):
+            self._send(self.server.news(parse_qs(asked)), {"Content-Type": "application/octet-stream"})
         else:
-            self.send_response(HTTPStatus.OK)
-            for name, value in (HEADERS | {"Content-Length": str(len(self.server.page))}).items():
-                self.send_header(name, value)
-            self.end_headers()
-            for at in range(0, len(self.server.page), CHUNK):
-                self.wfile.write(self.server.page[at : at + CHUNK])
+            self.send_error(HTTPStatus.NOT_FOUND)
+
+    def _send(self, body: bytes, headers: dict[str, str]) -> None:
+        self.send_response(HTTPStatus.OK)
+        for name, value in (HEADERS | headers | {"Content-Length": str(len(body))}).items():
+            self.send_header(name, value)
+        self.end_headers()
+        for at in range(0, len(body), CHUNK):
+            self.wfile.write(body[at : at + CHUNK])
 
     def log_message(self, format: str, *args: object) -> None:
         """Write nothing: the terminal belongs to the command."""
 
 
-def serve(page: bytes) -> PageServer:
+def serve(page: bytes, news: News | None = None) -> PageServer:
     """A listening server; ``serve_forever`` answers, leaving the ``with`` block closes it."""
-    return PageServer(page)
+    return PageServer(page, news)

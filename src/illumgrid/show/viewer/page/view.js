@@ -3,6 +3,7 @@
 import { fitted } from "./camera.js";
 import { listen, listenSplit } from "./input.js";
 import { lights } from "./lights.js";
+import { live } from "./live.js";
 import { LOOKS, Picture } from "./picture.js";
 import { PLACES, Resting } from "./resting.js";
 import { skyBall } from "./skies.js";
@@ -196,6 +197,12 @@ export function view(root, scene, data, shaders, { address = true, onChange = ()
   }
   controls();
   draw();
+  const renew = () => {
+    samples = 0;
+    rests = false;
+    draw();
+  };
+  if (scene.live) live(picture, scene, state, aspect, (text) => { part("subtitle").textContent = text; }, renew);
   return view_;
 }
 

@@ -1,0 +1,392 @@
+"""Light that is looked at while it is computed: coarse everywhere at first, then where one looks.
+
+`Live` stands between a run and what keeps it: it chooses the next piece of work by what the page shows, and holds the
+light that is there as textures, of which the page asks for what is new. Where a node has no light of its own yet, it
+has that of a lattice of every fourth node, which is lit first.
+"""
+
+import json
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from illumgrid.errors import BadInput
+from illumgrid.field.scene import Levels, Scene
+from illumgrid.field.volume import Floats
+from illumgrid.grid import GREY, RGB, GridSpec, IlluminationGrid, WallTexture, channels_of, fill_holes
+from illumgrid.light import Illumination
+from illumgrid.show.viewer.arrays import HOLE
+from illumgrid.show.viewer.packing import MOST_NODES, Stage
+from illumgrid.transport.samples import Queries, Samples
+from illumgrid.transport.walk import Answer, Chooser
+
+STEP = 4
+"""Nodes from one of the coarse lattice to the next; as many on a side of a block, whose nodes are lit together."""
+SIDE = 16
+"""Nodes on a side of the boxes in which light goes to the page."""
+MOST = 1 << 24
+"""Bytes of one answer to the page, and a box of every texture's share of a piece."""
+OUTSIDE, BEHIND = 0.25, 0.05
+"""Of a whole sweep: how much later blocks out of view, and in view behind others, come."""
+
+
+class Stopped(Exception):
+    """The person who looked has left."""
+
+
+@dataclass(frozen=True)
+class Attention:
+    """What the page shows: a place of the sweep, and an eye and its direction in the coordinates of the stage."""
+
+    sweep: float = 0.5
+    eye: Floats | None = None
+    forward: Floats | None = None
+    slope: float = 1.0
+
+    @classmethod
+    def of(cls, asked: Mapping[str, Sequence[str]]) -> "Attention":
+        """As an address says it; what is not understood is left out."""
+        try:
+            numbers = {key: np.array(asked[key][0].split(","), float) for key in ("sweep", "eye", "forward", "slope")}
+        except (KeyError, ValueError):
+            return cls()
+        shapes = [n.shape for n in numbers.values()]
+        if shapes != [(1,), (3,), (3,), (1,)] or not all(np.isfinite(n).all() for n in numbers.values()):
+            return cls()
+        sweep, eye, forward, slope = numbers.values()
+        return cls(float(sweep[0]), eye, forward, float(slope[0]))
+
+    def delay(self, low: Floats, high: Floats, middle: Floats) -> Floats:
+        """How late blocks (n,) come, of the sweep from `low` to `high` and around `middle` (n, 3); NaN: always seen."""
+        late = np.maximum(0.0, np.maximum(low - self.sweep, self.sweep - high))
+        if self.eye is None or self.forward is None:
+            return late
+        away = middle - self.eye
+        depth = away @ self.forward
+        aside = np.linalg.norm(away - depth[:, None] * self.forward, axis=1)
+        hidden = np.where(np.isnan(depth), False, aside > 1.2 * self.slope * depth)
+        behind = np.clip((np.nan_to_num(depth, nan=0.0)) / max(float(np.nanmax(np.r_[depth, 1e-9])), 1e-9), 0, 1)
+        return np.asarray(late + OUTSIDE * hidden + BEHIND * behind)
+
+
+@dataclass(eq=False)
+class Texture:
+    """Light that is shown (nx, ny, nz, C) of a field's nodes, or (K, nv, nu, C) of a wall's texels, as far as known."""
+
+    light: NDArray[np.float32]
+    known: NDArray[np.bool_]
+    stamps: NDArray[np.int64]
+    """Of each box of `SIDE` on a side: when its light last changed."""
+
+    @classmethod
+    def of(cls, shape: Sequence[int], channels: int) -> "Texture":
+        """Nothing is lit."""
+        boxes = [-(-n // SIDE) for n in shape]
+        return cls(np.zeros((*shape, channels), np.float32), np.zeros(shape, bool), np.zeros(boxes, np.int64))
+
+    def paint(self, flat: NDArray[np.int64], light: NDArray[np.float32], stamp: int) -> None:
+        """Put the light (n, C) of some nodes in its place."""
+        self.light.reshape(-1, self.light.shape[-1])[flat] = light
+        self.known.reshape(-1)[flat] = True
+        at = np.unravel_index(flat, self.known.shape)
+        self.stamps[tuple(index // SIDE for index in at)] = stamp
+
+    def fill(self, spacing: Floats, stamp: int) -> None:
+        """Give nodes without light that of the coarse lattice, in straight lines; what it lacks, it has from nearby."""
+        coarse = tuple(slice(None, None, STEP) for _ in range(3))
+        support = self.known[coarse].astype(np.float32)
+        if support.any():
+            even = fill_holes(spacing, self.light[coarse], support)
+        else:
+            some = self.light[self.known]
+            even = np.broadcast_to(some.mean(axis=0) if len(some) else np.float32(0), (*support.shape, 1))
+        for axis, count in enumerate(self.known.shape):
+            at = np.minimum(np.arange(count) / STEP, even.shape[axis] - 1)
+            low = at.astype(int)
+            share = (at - low).astype(np.float32).reshape([-1 if k == axis else 1 for k in range(4)])
+            high = np.minimum(low + 1, even.shape[axis] - 1)
+            even = (1 - share) * np.take(even, low, axis) + share * np.take(even, high, axis)
+        self.light[~self.known] = np.broadcast_to(even, self.light.shape)[~self.known]
+        self.stamps[:] = stamp
+
+
+@dataclass(eq=False)
+class _Places:
+    """Where the light of each row goes, and what decides when it is asked for."""
+
+    texture: NDArray[np.int64]  # number of its texture, -1 for what is not shown before the end
+    flat: NDArray[np.int64]
+    block: NDArray[np.int64]
+    first: NDArray[np.bool_]
+    low: Floats  # of each block: where in the sweep it is seen
+    high: Floats
+    middle: Floats
+
+
+@dataclass(eq=False)
+class Live:
+    """Light as it comes in: a keeper that chooses what is next, and answers the page.
+
+    Parameters
+    ----------
+    keeper : RunKeeper
+        Keeps what comes in.
+    scene : Scene
+    specs : sequence of GridSpec
+        As the run has them.
+    levels : Levels
+        Rows of the walls.
+    about : dict
+        Where the scene comes from, for the recipe of a run that is gone on with by its folder.
+    """
+
+    keeper: Any
+    scene: Scene
+    specs: Sequence[GridSpec]
+    levels: Levels
+    about: dict[str, Any]
+    at_once: bool = True
+    attention: Attention = field(default_factory=Attention)
+    coarse: threading.Event = field(default_factory=threading.Event)
+    """Set when there is light everywhere."""
+    stop: threading.Event = field(default_factory=threading.Event)
+    """To be set when nobody looks on any more."""
+    ended: bool = False
+    """Whether all light is there."""
+    done: bool = False
+    """Whether it is saved, too."""
+
+    def __post_init__(self) -> None:
+        if any(np.prod(spec.shape) > MOST_NODES for spec in self.specs):
+            raise BadInput(f"a page holds {MOST_NODES} nodes at most while they are lit; choose a smaller --grid")
+        self.chosen: dict[str, Any] | None = self.keeper.chosen
+        own = channels_of(self.scene).own
+        self._shapes = [spec.shape for spec in self.specs]
+        self._shapes += [(len(self.levels.table), *quad.texels[::-1]) for quad in self.scene.quads]
+        self._textures = [Texture.of(shape, own) for shape in self._shapes]
+        self._lock, self._stamp, self._scale = threading.Lock(), 0, 1.0
+        self._batches: list[int] = [0]
+        self._late: tuple[Attention, Floats] | None = None
+        self._places: _Places | None = None
+        self._left, self._paths = 1, range(0)
+        self._waiting: Callable[[], None] | None = None
+        self._held: list[tuple[NDArray[np.int64], Answer]] = []
+
+    # --- the keeper of a run -------------------------------------------------------------------------------------
+
+    def choose(self, chosen: dict[str, Any]) -> None:
+        """See `RunKeeper`."""
+        self.keeper.choose({**chosen, "lazy": self.about})
+
+    def begin(self, targets: Sequence[Queries], order: NDArray[np.int64]) -> Chooser:
+        """See `Keeper`.
+
+        Of a run that is new the keeper, which has much to look at, learns when there is light everywhere.
+        """
+        self._waiting = partial(self.keeper.begin, targets, order)
+        if self.chosen:
+            self._waiting()
+            self._waiting = None
+        self._batches = np.cumsum([0, *map(len, targets)]).tolist()
+        self._places = self._placed(targets)
+        self._lit, self._left = np.zeros(self._batches[-1], bool), self._batches[-1]
+        return self.next
+
+    def known(self, paths: range) -> Answer | None:
+        """See `Keeper`."""
+        self._paths = paths
+        found: Answer | None = None if self._waiting else self.keeper.known(paths)
+        if found is not None:
+            rows = np.flatnonzero(found.paths >= 0)
+            self._show(rows, found.light[rows])
+        return found
+
+    def keep(self, rows: NDArray[np.int64], answer: Answer) -> None:
+        """See `Keeper`."""
+        self._held.append((rows, answer))
+        self._show(rows, answer.light)
+        if self.coarse.is_set():
+            self._hand_on()
+            self.keeper.settle()
+        if self.stop.is_set():
+            raise Stopped
+
+    def _hand_on(self) -> None:
+        """Let the keeper have what came in."""
+        if self._waiting:
+            self._waiting()
+            self._waiting = None
+            self.keeper.known(self._paths)
+        for rows, answer in self._held:
+            self.keeper.keep(rows, answer)
+        self._held.clear()
+
+    def flush(self) -> None:
+        """See `Keeper`."""
+        if not self._waiting:
+            self.keeper.flush()
+
+    def end(self, answers: Sequence[Samples]) -> None:
+        """See `Keeper`."""
+        self.ended = True
+        self._hand_on()
+        self.keeper.end(answers)
+
+    # --- what is next --------------------------------------------------------------------------------------------
+
+    def next(self, unknown: NDArray[np.bool_], most: Sequence[int]) -> tuple[int, NDArray[np.int64]]:
+        """The batch of the next piece and targets of it: the coarse lattice, then blocks that are looked at."""
+        late, rows = self._delays(), np.flatnonzero(unknown)
+        if self._places is not None and (first := rows[self._places.first[rows]]).size:
+            rows = first
+        number = int(np.searchsorted(self._batches, rows[late[rows].argmin()], side="right")) - 1
+        begin, stop = self._batches[number : number + 2]
+        own = rows[np.searchsorted(rows, begin) : np.searchsorted(rows, stop)]
+        if len(own) > most[number]:
+            own = np.sort(own[np.argpartition(late[own], most[number])[: most[number]]])
+        return number, own - begin
+
+    def _delays(self) -> Floats:
+        """For each row how late it comes."""
+        looked, places = self.attention, self._places
+        if places is None:
+            raise RuntimeError("nothing was begun")
+        if self._late is None or self._late[0] is not looked:
+            delay = looked.delay(places.low, places.high, places.middle)[places.block]
+            delay[places.texture < 0] += 10.0  # levels that are held: when the rest is there
+            self._late = looked, delay
+        return self._late[1]
+
+    def _placed(self, targets: Sequence[Queries]) -> _Places:
+        stage, fields, rows = Stage.of(self.scene), len(self.specs), len(self.levels.table)
+        count, blocks = self._batches[-1], 0
+        texture, flat, block = (np.full(count, -1, np.int64) for _ in range(3))
+        low, high, middle, coarse = np.zeros(count), np.ones(count), np.full((count, 3), np.nan), np.zeros(count, bool)
+        for queries, begin in zip(targets, self._batches):
+            for target in np.unique(queries.target).tolist():
+                of = np.flatnonzero(queries.target == target)
+                own, shape = queries[of], self._shapes[target]
+                flat[begin + of] = own.id & np.uint64((1 << 40) - 1)  # of `Direct`, and of texels
+                index = np.array(np.unravel_index(flat[begin + of], shape))
+                if target < fields:
+                    low[begin + of] = high[begin + of] = self.scene.fields[target].place(own.level[:, target])
+                    middle[begin + of] = stage.place(own.point)
+                else:
+                    low[begin + of], high[begin + of] = ((index[0] + k) / max(rows - 1, 1) for k in (-1, 1))
+                held = (own.id >> np.uint64(56)) > 0
+                texture[begin + of] = np.where(held, -1, target)
+                step = (STEP, STEP, STEP) if target < fields else (1, STEP, STEP)
+                sizes = [-(-n // s) for n, s in zip(shape, step)]
+                block[begin + of] = blocks + np.ravel_multi_index(tuple(i // s for i, s in zip(index, step)), sizes)
+                blocks += int(np.prod(sizes))
+                first = (index % STEP == 0).all(axis=0)
+                first[:: STEP**3] |= not first.any()
+                coarse[begin + of] = first & ~held
+        return _Places(texture, flat, block, coarse, *_of_blocks(block, blocks, low, high, middle))
+
+    # --- what is there -------------------------------------------------------------------------------------------
+
+    def _show(self, rows: NDArray[np.int64], light: NDArray[np.float32]) -> None:
+        places = self._places
+        if places is None:
+            return
+        with self._lock:
+            self._stamp += 1
+            for number in np.unique(places.texture[rows]).tolist():
+                if number >= 0:
+                    texture, own = self._textures[number], places.texture[rows] == number
+                    texture.paint(places.flat[rows[own]], light[own][:, : texture.light.shape[-1]], self._stamp)
+            self._lit[rows] = True
+            self._left -= len(rows)
+            if not self.coarse.is_set() and self._lit[places.first].all():
+                self._stamp += 1
+                for texture, spec in zip(self._textures, self.specs):
+                    texture.fill(STEP * spec.spacing, self._stamp)
+                for texture in self._textures[len(self.specs) :]:
+                    texture.fill(np.array([1e3, 1.0, 1.0]), self._stamp)
+                self.coarse.set()
+
+    @property
+    def share(self) -> float:
+        """Of all targets, those that are lit."""
+        return 1 - self._left / max(self._batches[-1], 1)
+
+    def light(self) -> tuple[Illumination, int]:
+        """The light that is there, as it is shown, and its stamp; its errors are not known before the end."""
+        channels = GREY if channels_of(self.scene).grey else RGB
+        with self._lock:
+            grids = tuple(
+                IlluminationGrid(
+                    spec, t.light.copy(), np.full(spec.shape, np.inf, np.float32), t.known.astype(np.float32), channels
+                )
+                for t, spec in zip(self._textures, self.specs)
+            )
+            walls = tuple(
+                WallTexture(t.light.copy(), t.known.astype(np.float32), channels)
+                for t in self._textures[len(self.specs) :]
+            )
+            shown = Illumination(self.scene, self.levels, grids, walls, {"seed": 0})
+            self._scale = shown.exposure / np.pi
+            return shown, self._stamp
+
+    def news(self, asked: Mapping[str, Sequence[str]]) -> bytes:
+        """What changed since the page last asked, which says what it shows: a header in JSON, then half floats.
+
+        The header is preceded by its length in four bytes, the lowest first, and ends at a multiple of four.
+        """
+        self.attention = Attention.of(asked)
+        since = int(asked["since"][0]) if asked.get("since", [""])[0].isdecimal() else 0
+        parts: list[dict[str, Any]] = []
+        data: list[bytes] = []
+        room = MOST
+        with self._lock:
+            found = [(int(t.stamps[at]), k, at) for k, t in enumerate(self._textures) for at in _newer(t.stamps, since)]
+            found.sort(key=lambda each: each[0])
+            upto = self._stamp
+            for stamp, number, at in found:
+                if room < 0 and stamp > parts[-1]["stamp"]:
+                    upto = parts[-1]["stamp"]
+                    break
+                low, texels = self._box(number, at)
+                parts.append({"texture": number, "stamp": stamp, "from": low, "shape": list(texels.shape[2::-1])})
+                data.append(texels.tobytes())
+                room -= texels.nbytes
+            header = {"stamp": upto, "share": self.share, "done": self.done and upto == self._stamp, "parts": parts}
+        head = json.dumps(header).encode()
+        head += b" " * (-len(head) % 4)
+        return b"".join([len(head).to_bytes(4, "little"), head, *data])
+
+    def _box(self, number: int, at: tuple[int, ...]) -> tuple[list[int], NDArray[np.float16]]:
+        """A box of a texture as the page has it: where it begins along x, y, z, and texels (z, y, x, C + 1)."""
+        texture = self._textures[number]
+        box = tuple(slice(SIDE * k, SIDE * k + SIDE) for k in at)
+        light = texture.light[box] * self._scale
+        texels = np.concatenate([light, np.full((*light.shape[:3], 1), HOLE, np.float32)], axis=3).clip(-65504, 65504)
+        low = [SIDE * k for k in at]
+        if number < len(self.specs):
+            return low, np.ascontiguousarray(texels.transpose(2, 1, 0, 3), np.float16)
+        low[2] += sum(quad.texels[0] for quad in self.scene.quads[: number - len(self.specs)])
+        return low[::-1], np.ascontiguousarray(texels, np.float16)
+
+
+def _newer(stamps: NDArray[np.int64], since: int) -> list[tuple[int, ...]]:
+    return [tuple(at) for at in np.argwhere(stamps > since).tolist()]
+
+
+def _of_blocks(
+    block: NDArray[np.int64], count: int, low: Floats, high: Floats, middle: Floats
+) -> tuple[Floats, Floats, Floats]:
+    """Where in the sweep each block of rows is seen, with half a block more on either side, and its middle."""
+    least, most, mean = np.full(count, np.inf), np.full(count, -np.inf), np.zeros((count, 3))
+    np.minimum.at(least, block, low)
+    np.maximum.at(most, block, high)
+    many = np.maximum(np.bincount(block, minlength=count), 1)
+    for axis in range(3):
+        mean[:, axis] = np.bincount(block, middle[:, axis], count) / many
+    more = np.where(least <= most, (most - least) / 2, 0.0)
+    return least - more, most + more, mean
