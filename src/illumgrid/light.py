@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     import trimesh
 
     from illumgrid.io.elsewhere import Source
+    from illumgrid.show.tints import Tint
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,7 +225,9 @@ class Illumination:
             lit.visual = type(visual)(lit, vertex_colors=self.color(points, field))
         return lit
 
-    def show(self, isovalue: float | None = None, height: int = 520, up: str | None = None) -> Any:
+    def show(
+        self, isovalue: float | None = None, height: int = 520, up: str | None = None, tint: "Tint | None" = None
+    ) -> Any:
         """View in a notebook: the interactive page, with its isovalue as a synced trait.
 
         Parameters
@@ -235,6 +238,8 @@ class Illumination:
             Pixels.
         up : {"x", "y", "z", "-x", "-y", "-z"}, optional
             World direction that is up; by default that of the still pictures.
+        tint : illumgrid.show.tints.Tint, optional
+            A second quantity that colours all fields.
 
         Returns
         -------
@@ -248,7 +253,7 @@ class Illumination:
         """
         from illumgrid.show.viewer.widget import widget
 
-        return widget(self, isovalue, height, up)
+        return widget(self, isovalue, height, up, tint)
 
     def _repr_png_(self) -> bytes:
         """Still picture, as a notebook shows it."""

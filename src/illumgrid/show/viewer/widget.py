@@ -7,6 +7,7 @@ import numpy as np
 
 from illumgrid.errors import BadInput
 from illumgrid.light import Illumination
+from illumgrid.show.tints import Tint
 from illumgrid.show.viewer import compressed, script, shaders, source
 
 
@@ -53,14 +54,20 @@ def _widget_class() -> type[Any]:
     return View
 
 
-def widget(light: Illumination, isovalue: float | None = None, height: int = 520, up: str | None = None) -> Any:
+def widget(
+    light: Illumination,
+    isovalue: float | None = None,
+    height: int = 520,
+    up: str | None = None,
+    tint: Tint | None = None,
+) -> Any:
     """A widget that shows `light`; see `Illumination.show`."""
     import json
 
     view = _widget_class()
     from illumgrid.show.viewer.packing import kept_apart, packed
 
-    scene, data = packed(light, up)
+    scene, data = packed(light, up, tint)
     low, high = map(float, light.scene.fields[scene["lead"]].range)
     made = view(
         height=height,
