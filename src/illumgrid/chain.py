@@ -23,7 +23,7 @@ from illumgrid.constants import PATHS
 from illumgrid.errors import BadInput, tell, tell_after
 from illumgrid.field.lattice import specs_over
 from illumgrid.field.layers import layers_of
-from illumgrid.field.scene import Scene, level_table
+from illumgrid.field.scene import Scene, finer_texels, level_table, with_texels
 from illumgrid.io import needs, store
 from illumgrid.light import Illumination
 from illumgrid.stages import Backend, Interpolator, Sampler
@@ -61,6 +61,7 @@ def run(
     paths: int | None = None,
     bounces: int | None = None,
     isovalues: int | None = None,
+    texels: int | None = None,
     seed: int = 0,
     error: float | None = None,
     seconds: float | None = None,
@@ -86,6 +87,8 @@ def run(
         that is known well: see `illumgrid.bake.known.light_known_first`. A number given here is followed path by path.
     isovalues : int, optional
         Rows of the level table, 32 by default; if given, also the count of a sampler that is named and has one.
+    texels : int, optional
+        Along the longest edge of all walls; by default those of the scene, or with `error` as many as it takes.
     seed : int
         Equal seeds give bit-identical grids, on any number of threads.
     error : float, optional
@@ -118,6 +121,7 @@ def run(
         When the scene has no light, or nodes within the range are holes.
     """
     paths, bounces, seed = _whole_numbers(paths, bounces, seed)
+    scene = scene if texels is None else with_texels(scene, texels)
     levels = level_table(scene, 32 if isovalues is None else isovalues)
     options = {}
     if isovalues is not None and isinstance(sampler, str) and "count" in registry.option_names("sampler", sampler):
@@ -136,13 +140,16 @@ def run(
     elif error is not None or seconds is not None:
         progress("pilot", 0, 1)
         plan = planned(
-            scene, tracer, levels, error=error, seconds=seconds, grid=grid, paths=paths, bounces=bounces, seed=seed
-        )
+            scene, tracer, levels, error=error, seconds=seconds, grid=grid, paths=paths, bounces=bounces,
+            texels=texels, seed=seed,
+        )  # fmt: skip
         progress("pilot", 1, 1)
         if plan.outlook:
             tell("plan", plan.outlook, stacklevel=2)
         grid, bounces = plan.grid, plan.bounces
         walked = [range(plan.paths)] if seconds is None or paths is not None else rounds(plan, begun + seconds)
+    if plan:
+        scene = finer_texels(scene, plan.finer if isinstance(plan, Plan) else plan.get("finer", 1.0))
     if not _shines(scene):
         tell("dark", "no background, lamp or surface of this scene emits light: all of it will be 0", stacklevel=2)
     specs = specs_over(scene, grid)

@@ -14,7 +14,7 @@ from illumgrid.bake.targets import coarse_first, held_queries, node_queries, of_
 from illumgrid.bake.walls import wall_queries, wall_texture
 from illumgrid.errors import BadInput
 from illumgrid.field.lattice import specs_over
-from illumgrid.field.scene import level_table
+from illumgrid.field.scene import finer_texels, level_table
 from illumgrid.field.volume import world_to_index
 from illumgrid.grid import IlluminationGrid, Nodes, WallTexture
 from illumgrid.io import disk, partial, store
@@ -52,6 +52,7 @@ def load(place: Path) -> tuple[Illumination, float]:
         stored = store.read(place / partial.SCENE)
         kept = partial.read(place)
         about, chosen, scene = kept.attributes["identity"], kept.attributes["chosen"], stored.scene
+        scene = finer_texels(scene, (chosen["plan"] or {}).get("finer", 1.0))
         sampler, interpolator = (
             registry.make(kind, about[kind]["name"], {k: v for k, v in about[kind].items() if k != "name"})
             for kind in ("sampler", "interpolator")

@@ -8,9 +8,10 @@ import numpy as np
 
 from illumgrid.accuracy.cost import Pace, measure_pace
 from illumgrid.accuracy.probe import FEWEST_PATHS, MOST_PATHS, Measured, Probe
+from illumgrid.accuracy.texels import Walls, walls_for
 from illumgrid.bake.walls import texel_paths, wall_queries
 from illumgrid.field.lattice import specs_over
-from illumgrid.field.scene import Levels, Scene
+from illumgrid.field.scene import Levels, Scene, finer_texels
 from illumgrid.rng import shifted_seed
 from illumgrid.transport.tracer import Tracer
 
@@ -62,6 +63,7 @@ class Plan:
     pilot: float  # seconds that the probe took
     met: bool  # whether the asked error, or time, is predicted to be kept
     why: tuple[str, ...]  # sentences for the user
+    finer: float = 1.0  # texels of walls along each edge, for each of the scene's
     outlook: str = ""  # said before the light is computed: a time that is too short, an error that takes long
 
 
@@ -177,12 +179,14 @@ def planned(
     grid: int | None = None,
     paths: int | None = None,
     bounces: int | None = None,
+    texels: int | None = None,
     seed: int = 0,
 ) -> Plan:
     """Choose nodes, paths and bounces of a run with `Direct` and `Nearest`, as far as they are not given.
 
     In the least time for a relative root mean square `error`, or the least error in `seconds`, with this choice and the
-    light of walls at `levels` included; the tracer marches level sets.
+    light of walls at `levels` included; the tracer marches level sets. For an error, texels as well: of each wall, at
+    least as many as it has.
     """
     begun = time.perf_counter()
     left = np.inf if seconds is None else JUDGED * seconds
@@ -196,12 +200,17 @@ def planned(
     about = 1 << 16 if seconds is None else int(np.clip(0.02 * left / search.pace.path, 1 << 12, 1 << 16))
     specs = specs_over(scene, look.choice.measured.grid)
     pace = measure_pace(scene, tracer, specs, look.choice.paths, look.bounces, seed, about)
+    walls = walls_for(scene, tracer, levels, look.bounces, error, seed) if error and texels is None else None
+    if walls is not None:
+        fine = wall_queries(finer_texels(scene, walls.finer), levels)
+        goal = replace(goal, texels=sum(len(queries) for queries in fine))
     choice = choose(look.tried, pace, replace(goal, seconds=left - (time.perf_counter() - begun)))
-    why = reasons(scene, choice, look.bounces, look.probe.left_out(look.bounces))
+    why = reasons(scene, choice, look.bounces, look.probe.left_out(look.bounces), walls)
+    said = outlook(look.tried, pace, replace(goal, seconds=np.inf if seconds is None else seconds), choice)
     return Plan(
         choice.measured.grid, choice.paths, look.bounces, choice.error, choice.seconds,
         choice.measured.nodes * pace.node, time.perf_counter() - begun, choice.met, why,
-        outlook(look.tried, pace, replace(goal, seconds=np.inf if seconds is None else seconds), choice),
+        1.0 if walls is None else walls.finer, said,
     )  # fmt: skip
 
 
@@ -231,14 +240,19 @@ def _time(seconds: float) -> str:
     return f"{seconds:.0f} seconds" if seconds < 90 else f"{seconds / 60:.0f} minutes"
 
 
-def reasons(scene: Scene, choice: Choice, bounces: int, left_out: float) -> tuple[str, ...]:
+def reasons(scene: Scene, choice: Choice, bounces: int, left_out: float, walls: Walls | None = None) -> tuple[str, ...]:
     """What was chosen, why, and what was left out, in sentences."""
     m, part = choice.measured, choice.measured.parts
     still, noise = np.sqrt(max(0.0, part.grid + part.uncovered)), np.sqrt(max(0.0, m.squared(choice.paths) - m.floor))
     nodes = sum(int(np.prod(spec.shape)) for spec in specs_over(scene, m.grid))
+    on_walls = []
+    if walls is not None:
+        longest = max(n for quad in finer_texels(scene, walls.finer).quads for n in quad.texels)
+        on_walls = [f"{longest} texels along walls: between them and rows of the sweep light is off by {walls.off:.1%}"]
     return (
         f"{m.grid} nodes along the longest axis: interpolation between them is off by {still:.1%}",
         f"{choice.paths} paths: noise of {noise:.1%} after interpolation",
         f"{bounces} bounces: further ones would add {left_out:.1%}",
         f"{nodes - m.nodes} of {nodes} nodes are omitted: no isosurface of the range is near them",
+        *on_walls,
     )

@@ -14,21 +14,23 @@ from illumgrid.transport.samples import Queries, Samples
 
 def wall_queries(scene: Scene, levels: Levels) -> list[Queries]:
     """Queries at the middles of the texels of every quad's front, for every row of levels: one batch a quad."""
-    batches = []
-    for number, quad in enumerate(scene.quads, len(scene.fields)):
-        nu, nv = quad.texels
-        rows, v, u = np.indices((len(levels.table), nv, nu)).reshape(3, -1)
-        point = quad.corner + ((u + 0.5) / nu)[:, None] * quad.edge_u + ((v + 0.5) / nv)[:, None] * quad.edge_v
-        batches.append(
-            Queries(
-                id=np.arange(len(rows), dtype=np.uint64) | np.uint64(number << 40),
-                point=point,
-                normal=np.tile(quad.normal, (len(rows), 1)),
-                level=levels.table[rows],
-                target=np.full(len(rows), number, np.int32),
-            )
-        )
-    return batches
+    counts = [len(levels.table) * quad.texels[0] * quad.texels[1] for quad in scene.quads]
+    return [at_texels(scene, levels, number, np.arange(count)) for number, count in enumerate(counts)]
+
+
+def at_texels(scene: Scene, levels: Levels, quad: int, texels: NDArray[np.int64]) -> Queries:
+    """Queries at the middles of some texels of a quad, by their numbers (n,) in an array (rows, v, u)."""
+    number, wall = quad + len(scene.fields), scene.quads[quad]
+    nu, nv = wall.texels
+    rows, v, u = np.unravel_index(texels, (len(levels.table), nv, nu))
+    point = wall.corner + ((u + 0.5) / nu)[:, None] * wall.edge_u + ((v + 0.5) / nv)[:, None] * wall.edge_v
+    return Queries(
+        id=texels.astype(np.uint64) | np.uint64(number << 40),
+        point=point,
+        normal=np.tile(wall.normal, (len(rows), 1)),
+        level=levels.table[rows],
+        target=np.full(len(rows), number, np.int32),
+    )
 
 
 def texel_paths(nodes: int, texels: int) -> int:

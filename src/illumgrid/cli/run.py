@@ -219,8 +219,8 @@ def run(
             say(_why_auto())
         with closing(keep), spread(workers, dask, any_machine) as over, progress_bars(keep.standing) as progress:
             light = light_up(
-                scene, **shared_out(stages, workers), **numbers, error=error, seconds=seconds, judge=False,
-                map=over, progress=progress, keep=keep,
+                scene, **shared_out(stages, workers), **numbers, error=error, seconds=seconds, texels=texels,
+                judge=False, map=over, progress=progress, keep=keep,
             )  # fmt: skip
         light = replace(light, recipe={**light.recipe, **about})
         elsewhere = asked.source(smooth or 0.0) if no_embed and asked.source else None

@@ -487,6 +487,18 @@ def with_texels(scene: Scene, longest: int) -> Scene:
     )
 
 
+def finer_texels(scene: Scene, times: float) -> Scene:
+    """The scene with so many times the texels along each edge of all walls that reflect light."""
+    if times == 1:
+        return scene
+
+    def finer(quad: Quad) -> Quad:
+        nu, nv = (max(1, round(times * n)) for n in quad.texels)
+        return replace(quad, texels=(nu, nv)) if quad.material.albedo.any() else quad
+
+    return replace(scene, quads=tuple(map(finer, scene.quads)))
+
+
 def box_around(volume: Volume, margin: float = 0.25) -> tuple[Quad, ...]:
     """Six inward-facing walls around a volume, and a luminaire close above the floor; `margin` in half extents."""
     right, front, up, centre, half = _upright_box(volume)
