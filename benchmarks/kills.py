@@ -249,7 +249,7 @@ def main():
             signals = SIGNALS[number % len(SIGNALS)]
             folder = place(work, str(number))
             try:
-                late = bool(command.writes) and number // 2 % 2 == 1
+                late = bool(command.writes) and number // 4 % 2 == 1  # each signal at moments of both kinds
                 found, took = stop(folder, command, known[at], finished, late, signals, chance)
                 slowest = max(slowest, took)
             except (AssertionError, OSError, ValueError) as trouble:
