@@ -21,6 +21,11 @@ SMALL = {"width": 24, "height": 18, "isovalue": 0.5}
 BLACK = (0.0, 0.0, 0.0)
 
 
+def plain(test):
+    """Run with the kernels as plain Python, too, which warns of infinite numbers that kernels mean."""
+    return pytest.mark.plain(pytest.mark.filterwarnings("ignore::RuntimeWarning")(test))
+
+
 def coat_of(light, roughness, rays=1):
     """Radiance that coats reflect where rays from the eye meet the ball, and the cosines there."""
     light = light.looking(roughness=roughness)
@@ -75,6 +80,7 @@ def test_rays_and_lights_that_are_asked_add_up_to_the_lobe():
     assert abs(off.mean()) < 0.01 * truth.mean() and np.sqrt((off**2).mean()) < 0.05 * truth.mean()
 
 
+@plain
 def test_a_mirror_shows_the_light_of_the_wall_that_it_faces():
     """A wall close below the ball, of 3 in its texture and albedo 0.5, with the sky black: F · 0.5 · 3 / π."""
     floor = Quad("floor", (-90, -90, -0.75), (180, 0, 0), (0, 180, 0), Material(np.full(3, 0.5)))
@@ -100,6 +106,7 @@ def test_black_films_dim_what_lies_behind(exact):
     assert cut[3] == pytest.approx(0.75 * 255, abs=1) and not cut[:3].any()
 
 
+@plain
 def test_the_inner_side_of_a_shell_is_lit_by_what_comes_through():
     """Under a sky of 1, E = π τ / (1 - a) within a closed shell, but for what its light lacks further reflections."""
     shell = Material(np.full(3, 0.2), transmission=0.5)
@@ -108,12 +115,12 @@ def test_the_inner_side_of_a_shell_is_lit_by_what_comes_through():
     light = lit(scene, np.pi * 0.5 / 0.8)  # grids hold the light of the inner side: the answer must be that, too
     shown = Shown(light, np.array([0.5]), 0.5)
     camera = fit_camera(scene, shown.row, 1.0)
-    front, back, *rest = layers_of(shown, camera.eye, software.directions_of(camera, 12, range(12), 12))
+    front, back, *rest = layers_of(shown, camera.eye, software.directions_of(camera, 8, range(8), 8))
     rows = np.flatnonzero(back.inner)
-    assert len(rows) > 200 and not front.inner.any() and not any(layer.inner.any() for layer in rest)
+    assert len(rows) > 100 and not front.inner.any() and not any(layer.inner.any() for layer in rest)
     assert np.allclose(back.weight[rows], 0.5) and np.allclose(back.behind[rows], 0.25)
     assert (np.einsum("ij,ij->i", back.hits.normal, back.hits.point)[rows] < 0).all()
-    found = arriving(shown, camera.eye, back, rows, rows.astype(np.uint64), range(64), 1, True) * np.pi / 64
+    found = arriving(shown, camera.eye, back, rows, rows.astype(np.uint64), range(4), 1, True) * np.pi / 4
     assert found.mean() == pytest.approx(np.pi * 0.5 / 0.8, rel=0.005)
 
 

@@ -253,7 +253,8 @@ def cast_layers(scene, level, origin, direction, start, t, number, what, normal,
         while layer < t.shape[0]:
             step, met, kind, face = hit_beyond(scene, level, x, none, d, on, face, bits)
             passed += step
-            x = (x[0] + step * d[0], x[1] + step * d[1], x[2] + step * d[2])
+            if kind != MISS:
+                x = (x[0] + step * d[0], x[1] + step * d[1], x[2] + step * d[2])
             if kind == QUAD and dot(scene.quad_normal[met - fields], d) >= 0.0:
                 on = met  # a wall seen from behind is not there
                 continue
