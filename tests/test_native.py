@@ -17,7 +17,8 @@ from illumgrid.field.diagnosis import critical_isovalues, diagnose, plateaus, tu
 from illumgrid.field.lattice import nodes_over
 from illumgrid.field.levelset import isosurface, marchable
 from illumgrid.field.scene import Field, Scene
-from illumgrid.field.volume import NATIVE, Volume, histogram, interpolate, outward_normals, project, smooth
+from illumgrid.field.storing import NATIVE
+from illumgrid.field.volume import Volume, histogram, interpolate, outward_normals, project, smooth
 from illumgrid.show.picture import render
 from illumgrid.show.viewer.packing import packed
 from illumgrid.transport.samples import Queries

@@ -8,7 +8,8 @@ import pytest
 import SimpleITK as sitk  # noqa: N813
 import tifffile
 
-from illumgrid.field.volume import NATIVE, index_to_world
+from illumgrid.field.storing import NATIVE
+from illumgrid.field.volume import index_to_world
 from illumgrid.io.readers import read_volume, volume_name
 from volume_files import (
     ORIGIN,

@@ -10,7 +10,8 @@ import pytest
 
 from illumgrid.errors import BadInput
 from illumgrid.field.scene import Field, Levels, Material, Quad, Scene, level_table
-from illumgrid.field.volume import NATIVE, Volume
+from illumgrid.field.storing import NATIVE
+from illumgrid.field.volume import Volume
 from illumgrid.grid import GREY, RGB, Channels, GridSpec, IlluminationGrid, WallTexture
 from illumgrid.io import store
 

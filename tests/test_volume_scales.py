@@ -9,7 +9,8 @@ import illumgrid as ig
 from illumgrid.errors import BadInput, shown, shown_range
 from illumgrid.field.diagnosis import critical_isovalues, diagnose, plateaus
 from illumgrid.field.lattice import GridSpec
-from illumgrid.field.volume import NATIVE, interpolate
+from illumgrid.field.storing import NATIVE
+from illumgrid.field.volume import interpolate
 from illumgrid.samplers.adaptive import adaptive_rows
 from illumgrid.transport.samples import in_frame
 
@@ -157,6 +158,7 @@ def test_a_volume_with_something_replaced_is_the_same_field():
 def test_a_map_that_leads_beyond_double_precision_is_refused():
     with pytest.raises(BadInput, match="beyond the numbers of double precision"):
         ig.Volume(np.arange(8, dtype=np.uint8).reshape(2, 2, 2), slope=1e308)
+    assert not ig.Volume(np.zeros((2, 2, 2), np.uint8), slope=1e300).values.any()
 
 
 def test_numbers_are_distinguished():

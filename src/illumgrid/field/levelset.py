@@ -12,7 +12,8 @@ from illumgrid.field import cubes
 from illumgrid.field.bricks import Bricks, lay_bricks
 from illumgrid.field.layers import ALL, Channel, light_tables
 from illumgrid.field.scene import Scene
-from illumgrid.field.volume import NATIVE, UPWARD, Floats, Side, Volume, index_to_world, slabs
+from illumgrid.field.storing import NATIVE
+from illumgrid.field.volume import UPWARD, Floats, Side, Volume, index_to_world, slabs
 
 if TYPE_CHECKING:
     import trimesh

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from illumgrid.constants import ON_A_VOXEL
 from illumgrid.errors import BadInput, shown_range, tell
+from illumgrid.field.storing import as_stored
 
 Floats = NDArray[np.float64]
 Side = Literal["above", "below"]
@@ -74,9 +75,6 @@ def placement(origin: ArrayLike, spacing: ArrayLike, direction: ArrayLike) -> tu
     return at, step, axes if np.abs(axes @ axes.T - np.eye(3)).max() < 1e-14 else nearest
 
 
-NATIVE = tuple(map(np.dtype, ("uint8", "int8", "uint16", "int16", "float32")))
-"""Types of values that are kept as they come: each number of theirs is one of single precision."""
-
 AT_ONCE = 1 << 22
 """Voxels that are looked at together: bounds the memory."""
 
@@ -94,7 +92,7 @@ class Volume:
 
     Values of 8 or 16 bits and of single precision are stored as they come, without a copy where they lie in C order
     and are h; where slope and intercept are whole numbers and h fits into as many bits, h is stored. Values of other
-    types are stored in single precision. Where that would cost h more than `DIGITS` of its span (a large offset), or
+    types are stored in single precision. Where that would cost h more than 1e-5 of its span (a large offset), or
     where h is beyond the numbers of single precision, they are mapped onto about -1 to 1; slope and intercept undo it.
 
     Parameters
@@ -118,7 +116,7 @@ class Volume:
         h at the voxel centres, read-only: what is stored where the slope is 1 and the intercept 0; otherwise computed
         each time it is asked for, in double precision.
     stored : (nx, ny, nz) array
-        What is kept, of one of the types `NATIVE`, C order, read-only.
+        What is kept, of one of the types `storing.NATIVE`, C order, read-only.
     slope, intercept : float
         What turns what is stored into h; the slope is positive.
 
@@ -158,7 +156,7 @@ class Volume:
         slope, intercept = float(slope), float(intercept)
         if not (np.isfinite([slope, intercept]).all() and slope):
             raise BadInput(f"slope and intercept are {slope} and {intercept}; expected finite numbers, the first not 0")
-        kept, slope, intercept = _as_kept(*_upward(given, slope, intercept))
+        kept, slope, intercept = as_stored(given, slope, intercept)
         kept = np.ascontiguousarray(kept).view()
         if not any(np.isfinite(kept[slab]).any() for slab in slabs(kept.shape)):
             raise BadInput("the values are all NaN or infinite; expected finite numbers")
@@ -249,73 +247,6 @@ class Volume:
     def with_stored(self, stored: NDArray[Any]) -> "Volume":
         """Other stored values on the same lattice, with the same map."""
         return Volume(stored, self.origin, self.spacing, self.direction, self.slope, self.intercept, self.unit)
-
-
-def _upward(values: NDArray[Any], slope: float, intercept: float) -> tuple[NDArray[Any], float, float]:
-    """The same field with a positive slope; values of 8 or 16 bits are turned within their type."""
-    if slope > 0:
-        return values, slope, intercept
-    if values.dtype.newbyteorder("=") in NATIVE and values.dtype.kind in "iu":
-        ends = np.iinfo(values.dtype)  # ~v = min + max - v
-        return ~values, -slope, intercept + slope * (ends.min + ends.max)
-    return -values.astype(np.float32 if values.dtype in NATIVE else float), -slope, intercept
-
-
-DIGITS = 1e-5
-"""Share of the span of a field that rounding to single precision may cost it."""
-
-
-def _as_kept(values: NDArray[Any], slope: float, intercept: float) -> tuple[NDArray[Any], float, float]:
-    """The same field with values of a `NATIVE` type: as they came, wherever one holds them well."""
-    native = values.dtype.newbyteorder("=")
-    if values.dtype == np.bool_:
-        return values.astype(np.uint8), slope, intercept
-    if native in NATIVE or native == np.float16:
-        values = values.astype(np.float32 if native == np.float16 else native, copy=False)
-        return _whole_numbers(values, slope, intercept)
-    values, slope, intercept = _for_single_precision(values, slope, intercept)
-    with np.errstate(over="ignore"):  # a float64 beyond float32 becomes infinite, which is handled
-        return values.astype(np.float32, copy=False), slope, intercept
-
-
-def _whole_numbers(values: NDArray[Any], slope: float, intercept: float) -> tuple[NDArray[Any], float, float]:
-    """The same field without slope and intercept, where they are whole and h fits into a type as small as that of v."""
-    kind = values.dtype
-    if kind.kind == "f" or (slope, intercept) == (1, 0) or not (slope.is_integer() and intercept.is_integer()):
-        return values, slope, intercept
-    low, high = (int(end) * int(slope) + int(intercept) for end in (values.min(), values.max()))
-    for other in (kind, np.dtype(f"u{kind.itemsize}"), np.dtype(f"i{kind.itemsize}")):
-        if np.iinfo(other).min <= low and high <= np.iinfo(other).max:
-            whole = np.empty(values.shape, other)
-            for slab in slabs(values.shape):
-                whole[slab] = values[slab].astype(np.int64) * int(slope) + int(intercept)
-            return whole, 1.0, 0.0
-    return values, slope, intercept
-
-
-def single_precision_holds(low: float, high: float) -> bool:
-    """Whether rounding to single precision costs values from `low` to `high` at most `DIGITS` of half their span."""
-    largest, half = max(abs(low), abs(high)), high / 2 - low / 2  # halves: the whole may overflow
-    return largest * float(np.finfo(np.float32).eps) / 4 <= DIGITS * half and 1e-30 <= largest <= 1e30
-
-
-def _for_single_precision(values: NDArray[Any], slope: float, intercept: float) -> tuple[NDArray[Any], float, float]:
-    """The same field with values that single precision holds well: as they came, wherever it does."""
-    wide = values.astype(np.float64) if values.dtype != np.float64 else values
-    good = np.isfinite(wide)
-    if not good.any():
-        return values, slope, intercept
-    low, high = (float(f(wide, where=good, initial=i)) for f, i in ((np.min, np.inf), (np.max, -np.inf)))
-    largest, span = max(abs(low), abs(high)), high / 2 - low / 2  # halves: the whole may overflow
-    fits = largest * float(np.finfo(np.float32).eps) / 4 <= DIGITS * span
-    if span == 0 or single_precision_holds(low, high):
-        return values, slope, intercept
-    with np.errstate(over="ignore"):
-        if np.array_equal(wide[good].astype(np.float32), wide[good]):
-            return values, slope, intercept
-    middle = 0.0 if fits else low + span
-    scale = float(2.0 ** np.clip(np.frexp(span)[1], -1022, 1022))
-    return (wide - middle) / scale, slope * scale, intercept + slope * middle
 
 
 def histogram(volume: Volume, bins: int, ends: tuple[float, float] | None = None) -> tuple[NDArray[np.int64], Floats]:

@@ -30,7 +30,8 @@ import numpy as np
 from illumgrid.errors import BadInput
 from illumgrid.field.lights import Distant, Harmonics, Light, Sky
 from illumgrid.field.scene import Field, Levels, Material, Quad, Scene
-from illumgrid.field.volume import NATIVE, Lattice, Volume, histogram
+from illumgrid.field.storing import NATIVE
+from illumgrid.field.volume import Lattice, Volume, histogram
 from illumgrid.grid import RGB, Channels, GridSpec, IlluminationGrid, WallTexture
 from illumgrid.io import disk, exr
 from illumgrid.io.disk import ELSEWHERE

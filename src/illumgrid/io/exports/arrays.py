@@ -11,13 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from illumgrid.errors import BadInput
+from illumgrid.field.storing import single_precision_holds
 from illumgrid.field.volume import (
     Floats,
     Lattice,
     Volume,
     index_to_world,
     interpolate,
-    single_precision_holds,
     world_to_index,
 )
 from illumgrid.tone import curve, encode_srgb

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from illumgrid.errors import BadInput
-from illumgrid.field.volume import NATIVE, Floats, Volume
+from illumgrid.field.storing import NATIVE
+from illumgrid.field.volume import Floats, Volume
 from illumgrid.io.readers.limits import AS_FLOAT, check_axes, check_memory
 from illumgrid.io.readers.paged import resident, settled
 from illumgrid.io.readers.windows import Span, take
