@@ -70,12 +70,17 @@ def test_all_keys_are_taken(read):
     assert scene.background.tolist() == [0.1, 0.2, 0.3]
 
 
+def test_texels_that_are_left_out_fit_the_field(read):
+    wide = QUAD.replace("[1, 0, 0]", "[66, 0, 0]").replace("[0, 1, 0]", "[0, 33, 0]")  # in voxels of the field
+    assert read(FIELD + wide).quads[0].texels == (20, 10)  # one for about three voxels
+    assert read(FIELD + wide + "albedo = [0, 0, 0]").quads[0].texels == (1, 1)  # nothing to be seen
+
+
 def test_what_is_left_out_has_the_usual_value(read):
     scene = read(WHOLE)
     protons, wall = scene.fields[1], scene.quads[1]
     assert protons.inside == "above" and tuple(protons.range) == ig.suggest_range(protons.volume)[:2]
-    usual = ig.Quad("usual", (0, 0, 0), (1, 0, 0), (0, 1, 0))
-    assert wall.texels == usual.texels
+    assert wall.texels == (6, 6)  # the fewest beside a volume
     for part in (protons, wall):
         assert part.material.albedo.tolist() == [0.8] * 3 and part.material.emission.tolist() == [0] * 3
     for text in (FIELD, FIELD + "[background]"):

@@ -467,6 +467,14 @@ def _texel(volume: Volume, longest: float) -> int:
     return int(np.clip(round(longest / side * max(volume.shape) / 3.3), 6, 48))
 
 
+def fitting_texels(quad: Quad, volume: Volume) -> Quad:
+    """A wall beside a volume with square texels, as many as those of `box_around`; one where no light is reflected."""
+    if not quad.material.albedo.any():
+        return replace(quad, texels=(1, 1))
+    longest = max(float(np.linalg.norm(edge)) for edge in (quad.edge_u, quad.edge_v))
+    return _square_texels(quad, _texel(volume, longest) / longest)
+
+
 def with_texels(scene: Scene, longest: int) -> Scene:
     """The scene with square texels, `longest` of them along the longest edge of all walls; a lamp keeps its own.
 

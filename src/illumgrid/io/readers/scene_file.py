@@ -12,7 +12,7 @@ import numpy as np
 
 from illumgrid.errors import BadInput
 from illumgrid.field.lights import Distant, Light, Sky
-from illumgrid.field.scene import Field, Material, Quad, Scene
+from illumgrid.field.scene import Field, Material, Quad, Scene, fitting_texels
 from illumgrid.field.signed import signed_pair, without_gaps
 from illumgrid.field.volume import Volume, finite, smooth
 
@@ -44,7 +44,8 @@ def read_scene(path: str | os.PathLike[str], *, smoothing: float = 0.0) -> Scene
         `downsample`, `follow`); ``[[quad]]`` with `name`, `corner`, `edge_u`, `edge_v` and perhaps `albedo`,
         `emission`, `texels`, `light`; ``[[light]]`` with `name` and either `radiance`, or `nadir` and `zenith`, or
         `image`, or `direction`, `angle` and `irradiance`, see `Sky` and `Distant`; ``[background]`` with `radiance`.
-        What is left out has the default of `Field`, `Material`, `Quad` or `Scene`.
+        What is left out has the default of `Field`, `Material`, `Quad` or `Scene`; texels that are left out fit the
+        first field, one for three voxels.
     smoothing : float, optional
         Standard deviation, in voxels, of a Gaussian that blurs every field before anything else.
 
@@ -340,7 +341,8 @@ def _scene(tables: Table, folder: Path, smoothing: float) -> Scene:
     for place, table in fields:  # last, because reading takes longest
         with _place(place):
             solids.extend(_fields(table, _volume(table, folder, smoothing, volumes)))
-    return Scene(tuple(solids), tuple(walls), radiance, tuple(lights))
+    fitted = [q if "texels" in t else fitting_texels(q, solids[0].volume) for q, (_, t) in zip(walls, quads)]
+    return Scene(tuple(solids), tuple(fitted), radiance, tuple(lights))
 
 
 def _light(table: Table, folder: Path) -> Light:
