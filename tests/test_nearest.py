@@ -110,5 +110,9 @@ def test_samples_on_nodes_fill_them_without_a_search_and_coincident_ones_are_sea
     spec = GridSpec.over(Volume(np.zeros((4, 4, 4))), 4)
     points = np.array([[1.0, 1, 1], [1 + 1e-8, 2, 2], [1, 1, 2], [1, 1, 2 + 1e-9], [2.4, 1, 1]])
     node, sample = on_nodes(spec, points)
-    assert sample.tolist() == [0, 1]
-    assert node.tolist() == [1 * 16 + 1 * 4 + 1, 1 * 16 + 2 * 4 + 2]
+    assert sample.tolist() == [0, 1, 2, 3]
+    assert node.tolist() == [1 * 16 + 1 * 4 + 1, 1 * 16 + 2 * 4 + 2, 1 * 16 + 1 * 4 + 2, 1 * 16 + 1 * 4 + 2]
+    queries = Queries(np.arange(5, dtype=np.uint64), points, np.ones((5, 3)), np.ones((5, 1)), np.zeros(5, np.int32))
+    mean = np.arange(1.0, 6, dtype=np.float32)[:, None]
+    grid = Nearest().fill(Samples(queries, mean, 0 * mean, np.full(5, 2, np.int32)), Nodes(spec, FIELD))
+    assert grid.light[1, [1, 2, 1], [1, 2, 2], 0].tolist() == [1, 2, 3]

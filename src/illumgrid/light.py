@@ -151,10 +151,14 @@ class Illumination:
     @cached_property
     def exposure(self) -> float:
         """Automatic exposure: one for all isovalues, views and fields, from the light that the grids hold."""
-        lit = [grid.lit for grid in self.grids]
-        albedo = [np.broadcast_to(f.material.albedo, e.shape) for f, e in zip(self.scene.fields, lit)]
+        mean, brightest = [], []
+        for f, grid in zip(self.scene.fields, self.grids):
+            for block in grid.blocks():
+                lit = block.values[block.support > 0]
+                mean.append(lit.mean(axis=1))
+                brightest.append((lit * f.material.albedo).max(axis=1))
         highlights = tone.DIRECTED if any(isinstance(one, Distant) for one in self.scene.lights) else tone.EVEN
-        return tone.automatic_exposure(np.concatenate(lit), np.concatenate(albedo), highlights)
+        return tone.exposure_under(np.concatenate(mean), np.concatenate(brightest), highlights)
 
     @cached_property
     def marchable(self) -> Marchable:

@@ -23,11 +23,18 @@ def automatic_exposure(
     Under the median light a colour given as albedo comes out as that colour, unless that share of the brightest channel
     would then exceed the radiance of `highlights`. 1 if all is dark.
     """
+    return exposure_under(irradiance.mean(axis=1), (irradiance * albedo).max(axis=1), highlights)
+
+
+def exposure_under(
+    mean: NDArray[np.floating], brightest: NDArray[np.floating], highlights: tuple[float, float] = EVEN
+) -> float:
+    """As `automatic_exposure`, from the mean irradiance (n,) and the brightest channel (n,) of albedo · irradiance."""
     share, most = highlights
-    if not len(irradiance):
+    if not len(mean):
         return 1.0
-    median = float(np.median(irradiance.mean(axis=1))) / np.pi
-    bright = float(np.quantile((irradiance * albedo).max(axis=1), share)) / np.pi
+    median = float(np.median(mean)) / np.pi
+    bright = float(np.quantile(brightest, share)) / np.pi
     factors = [target / value for target, value in ((1.0, median), (most, bright)) if 0 < value < np.inf]
     return min(factors, default=1.0)
 

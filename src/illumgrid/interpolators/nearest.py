@@ -1,5 +1,6 @@
 """Each node takes the light of the nearest sample."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -42,36 +43,43 @@ class Nearest:
                 if errors is not None and own.errors is not None:
                     errors[some] = own.errors
 
+        def points() -> Iterator[tuple[int, Floats]]:
+            for first in range(0, len(good), _SLAB):
+                yield first, samples.queries[good[first : first + _SLAB]].point
+
+        many = np.zeros(len(nodes), np.uint8)  # samples on each node: 0, 1, or 2 for more
+
+        def counted() -> Iterator[Floats]:
+            for _, some in points():
+                node, count = np.unique(on_nodes(spec, some)[0], return_counts=True)
+                many[node] = np.minimum(many[node] + count, 2)
+                yield some
+
         if len(good):
-            points = samples.queries.point if len(good) == len(samples) else samples.queries.point[good]
             reach = diagonal(spec)
-            candidates = near_samples(spec, points, reach).reshape(-1)
-            node, sample = on_nodes(spec, points)
-            take(node, sample)
-            candidates[node] = False
-            del node, sample
-            # Coordinates relative to the grid's origin: differences of large world coordinates would lose digits.
-            tree = KDTree(points - spec.origin)
-            for block in nodes.blocks(np.flatnonzero(candidates), _SLAB):
-                distance, sample = tree.query(block.point - spec.origin, distance_upper_bound=reach)
-                near = np.isfinite(distance)
-                take(block.flat[near], sample[near])
-            del tree
+            candidates = near_samples(spec, counted(), reach).reshape(-1)
+            for first, some in points():
+                node, sample = on_nodes(spec, some)
+                alone = many[node] == 1
+                take(node[alone], first + sample[alone])
+            candidates[many == 1] = False
+            if candidates.any():
+                # Coordinates relative to the grid's origin: differences of large world coordinates would lose digits.
+                tree = KDTree(np.concatenate([some - spec.origin for _, some in points()]))
+                for block in nodes.blocks(np.flatnonzero(candidates), _SLAB):
+                    distance, sample = tree.query(block.point - spec.origin, distance_upper_bound=reach)
+                    near = np.isfinite(distance)
+                    take(block.flat[near], sample[near])
+                del tree
         return nodes.grid(light, error, support, samples.channels, errors)
 
 
 def on_nodes(spec: GridSpec, points: Floats) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Flat numbers (m,) of the nodes that are one of the world points (n, 3), and which (m,); none that are two."""
-    nodes, which = [], []
-    for first in range(0, len(points), _SLAB):
-        index = world_to_index(spec, points[first : first + _SLAB])
-        closest = np.clip(np.round(index), 0, np.array(spec.shape) - 1)
-        point = np.flatnonzero((np.abs(index - closest) < _ON_A_NODE).all(axis=1))
-        nodes.append(np.ravel_multi_index(tuple(closest[point].astype(np.int64).T), spec.shape))
-        which.append(first + point)
-    node, point = np.concatenate([np.zeros(0, np.int64), *nodes]), np.concatenate([np.zeros(0, np.int64), *which])
-    alone = np.bincount(node, minlength=1)[node] == 1
-    return node[alone], point[alone]
+    """Flat numbers (m,) of the nodes that are one of the world points (n, 3), and which (m,)."""
+    index = world_to_index(spec, points)
+    closest = np.clip(np.round(index), 0, np.array(spec.shape) - 1)
+    point = np.flatnonzero((np.abs(index - closest) < _ON_A_NODE).all(axis=1))
+    return np.ravel_multi_index(tuple(closest[point].astype(np.int64).T), spec.shape), point
 
 
 @hookimpl

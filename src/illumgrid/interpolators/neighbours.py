@@ -1,6 +1,6 @@
 """The samples behind a node: the nearest ones on both level sets that it lies between."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -22,13 +22,13 @@ def diagonal(spec: GridSpec) -> float:
     return float(np.linalg.norm(spec.spacing)) * (1 + 1e-6)
 
 
-def near_samples(spec: GridSpec, points: Floats, reach: float) -> NDArray[np.bool_]:
-    """Nodes (nx, ny, nz) that may have one of the world points (n, 3) in their box of half-width `reach`."""
+def near_samples(spec: GridSpec, parts: Iterable[Floats], reach: float) -> NDArray[np.bool_]:
+    """Nodes (nx, ny, nz) that may have a world point of some arrays (n, 3) in their box of half-width `reach`."""
     from scipy.ndimage import maximum_filter
 
     taken = np.zeros(spec.shape, bool)
-    for first in range(0, len(points), _SLAB):
-        index = np.round(world_to_index(spec, points[first : first + _SLAB]))
+    for points in parts:
+        index = np.round(world_to_index(spec, points))
         taken[tuple(np.clip(index, 0, np.array(spec.shape) - 1).astype(np.int64).T)] = True
     # A point is at most half a node spacing from the node that it is rounded to.
     width = 2 * np.ceil(reach / spec.spacing + 0.5).astype(int) + 1
@@ -115,7 +115,7 @@ def neighbours(places: Sites, nodes: Nodes, count: int) -> Iterator[Neighbours]:
     trees = [KDTree(places.point[m]) for m in members]
     each = -(-count // len(members)) if members else count
     spec, near = nodes.spec, diagonal(nodes.spec)
-    candidates = np.flatnonzero(near_samples(spec, places.point + spec.origin, BETWEEN * near))
+    candidates = np.flatnonzero(near_samples(spec, [places.point + spec.origin], BETWEEN * near))
     for block in nodes.blocks(candidates, _SLAB):
         node, point = block.flat, block.point - spec.origin
         distance, site = np.full((len(node), len(trees), each), np.inf), np.zeros((len(node), len(trees), each), int)

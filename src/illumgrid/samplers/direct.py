@@ -82,7 +82,10 @@ class NodeQueries(Queries):
         return len(self.node)
 
     def __getitem__(self, rows: slice | NDArray[np.bool_] | NDArray[np.integer]) -> Queries:
-        return at_nodes(self.scene, self.field, self.spec, self.node[rows].astype(np.int64))
+        node = self.node[rows].astype(np.int64)
+        parts = [node[first : first + _BATCH] for first in range(0, len(node), _BATCH)] or [node]
+        found = [at_nodes(self.scene, self.field, self.spec, part) for part in parts]  # what is computed takes more
+        return found[0] if len(found) == 1 else join_queries(found)
 
     def _all(self, name: str) -> Floats:
         whole = np.empty((len(self), *getattr(self[:0], name).shape[1:]))
