@@ -109,6 +109,8 @@ class Volume:
         What turns the values given into h, in whose units all isovalues are.
     unit : str, optional
         Of the world coordinates, such as "mm" or "µm".
+    stored : array_like, optional
+        In place of `values`, and the same: so that ``dataclasses.replace`` can change the rest.
 
     Attributes
     ----------
@@ -175,7 +177,7 @@ class Volume:
 
     @property
     def values(self) -> NDArray[Any]:
-        """The field h at the voxel centres: (nx, ny, nz), read-only."""
+        """The field h at the voxel centres, (nx, ny, nz), read-only: stored, or computed each time it is asked for."""
         if self.plain:
             return self.stored
         values = np.empty(self.shape)
