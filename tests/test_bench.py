@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 from illumgrid import registry
-from illumgrid import run as run_chain
 from illumgrid.accuracy import chart as benches
 from illumgrid.accuracy import cost
 from illumgrid.accuracy.chart import _references, _remarks, _show_default, _thinned, _tracer_of, bench, contestants
@@ -26,8 +25,10 @@ from illumgrid.accuracy.reference import begin, errors
 from illumgrid.backends.numba_ import Numba
 from illumgrid.cli import report
 from illumgrid.cli.report import table
+from illumgrid.field.lattice import specs_over
 from illumgrid.field.scene import Field, Scene
 from illumgrid.field.volume import world_to_index
+from illumgrid.grid.nodes import reachable
 from illumgrid.interpolators.nearest import Nearest
 from illumgrid.interpolators.rbf import Rbf
 from illumgrid.interpolators.splat import Splat
@@ -380,16 +381,17 @@ def test_a_backend_that_fails_ends_its_own_race_only(truth, monkeypatch):
     assert {m.backend.name for m in entrants} == {"numba"} and notes == ["fake does not compete: no licence"]
 
 
-def test_of_fields_of_different_size_the_default_is_what_run_does():
+def test_of_fields_of_different_size_the_marked_setting_lights_the_nodes_of_each():
     fields = Field("fine", ball(12), range=(0.5, 0.9)), Field("coarse", ball(6, at=(0.5, 0, 0)), range=(0.5, 0.9))
     scene = Scene(fields, background=np.ones(3))
     tracer = prepare(BACKEND, scene)
     exact = begin(tracer, unseen_on_level_sets(scene, 4, 100, 0), 4, 0)
     race = Race(scene, {"levelset": exact}, [replace(METHOD, tracer=tracer)], [7, 14], 3, 0)
-    made = run_chain(scene, paths=4, bounces=1, isovalues=2)
+    specs = specs_over(scene)
+    nodes = sum(len(reachable(field, spec)) for field, spec in zip(fields, specs))
     for budget in (1e6, 1e-6):  # built, and predicted
         race.points = []
         _show_default(race, None, 4, budget)
         assert [p.default for p in race.points] == [True]
-        assert race.points[0].queries == made.recipe["queries"] and race.points[0].longest == made.recipe["grid"]
-    assert {max(grid.spec.shape) for grid in made.grids} == {14, 7}
+        assert race.points[0].queries == nodes and race.points[0].longest == 14
+    assert [max(spec.shape) for spec in specs] == [14, 7]

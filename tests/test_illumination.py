@@ -37,10 +37,13 @@ def test_the_light_of_a_convex_body_under_a_white_sky_is_pi(light):
     assert np.median(light_there) == pytest.approx(np.pi, rel=0.02)
 
 
-def test_by_default_the_grid_has_a_fifth_more_nodes_than_voxels_but_at_most_150():
-    assert ig.run(sky(ball(9)), paths=1, bounces=0).grids[0].spec.shape == (11, 11, 11)
-    wide = ball(shape=(3, 3, 150), origin=(-0.01, -0.01, -1), spacing=(0.01, 0.01, 2 / 149))
-    assert ig.run(sky(wide, (0.9, 1.0)), paths=1, bounces=0).grids[0].spec.shape == (3, 3, 150)
+def test_by_default_six_nodes_are_lit_for_seven_voxels_but_at_most_150_where_light_is_smooth():
+    assert ig.run(sky(ball(9)), paths=1, bounces=0).grids[0].spec.shape == (8, 8, 8)
+    wide = ball(shape=(3, 3, 200), origin=(-0.01, -0.01, -1), spacing=(0.01, 0.01, 2 / 199))
+    light = ig.run(sky(wide, (0.9, 1.0)), paths=1, bounces=0)
+    assert light.recipe["refined"]["from"] == 150
+    with_stages = ig.run(sky(ball(9)), paths=1, bounces=0, interpolator="splat")
+    assert with_stages.grids[0].spec.shape == (11, 11, 11)
 
 
 def test_the_recipe_says_how_it_was_made(light):

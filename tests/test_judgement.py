@@ -12,6 +12,7 @@ from illumgrid import chain
 from illumgrid.accuracy.judge import remedies
 from illumgrid.accuracy.probe import Probe
 from illumgrid.backends.numba_ import Numba
+from illumgrid.field.lattice import specs_over
 from shapes import ball, sky
 
 pytestmark = pytest.mark.judged
@@ -114,9 +115,9 @@ def test_remedies_are_those_of_the_grids_as_they_are_and_of_the_option_as_it_is_
         return measure(probe, specs, fewer, paths)
 
     monkeypatch.setattr(Probe, "measure", watched)
-    light = ig.run(scene, paths=2, bounces=1, isovalues=2)
-    assert remedies(scene, Numba(), [grid.spec for grid in light.grids], 1, 0).keys() == {"now", "finer", "smooth"}
-    assert seen[0] == seen[2] == [grid.spec.shape for grid in light.grids] == [(14,) * 3, (7,) * 3]
+    specs = specs_over(scene)
+    assert remedies(scene, Numba(), specs, 1, 0).keys() == {"now", "finer", "smooth"}
+    assert seen[0] == seen[2] == [spec.shape for spec in specs] == [(14,) * 3, (7,) * 3]
     assert seen[1] == [(28,) * 3, (28,) * 3]  # what --grid 28 makes
 
 

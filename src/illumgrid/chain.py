@@ -19,16 +19,21 @@ from illumgrid.bake import Baked, bake
 from illumgrid.bake.accumulator import Map, Progress
 from illumgrid.bake.bounces import enough_bounces, light_left_out
 from illumgrid.bake.known import light_known_first
-from illumgrid.constants import PATHS
+from illumgrid.bake.refined import MOST, Chosen, paths_for, written
+from illumgrid.bake.refined import chosen as nodes_to_light
+from illumgrid.constants import BASE, PATHS
 from illumgrid.errors import BadInput, tell, tell_after
 from illumgrid.field.lattice import specs_over
 from illumgrid.field.layers import layers_of
 from illumgrid.field.scene import Scene, finer_texels, level_table, with_texels
+from illumgrid.grid.cache import cache_of
+from illumgrid.grid.nested import finer, halvings
+from illumgrid.interpolators.nested import Nested
 from illumgrid.io import needs, store
 from illumgrid.light import Illumination
 from illumgrid.stages import Backend, Interpolator, Sampler
 from illumgrid.transport.stages import capabilities
-from illumgrid.transport.tracer import Tracer, prepare
+from illumgrid.transport.tracer import Tracer, ending_in, prepare
 from illumgrid.transport.walk import RunKeeper
 
 MANY_BOUNCES = 4
@@ -78,13 +83,16 @@ def run(
     sampler, backend, interpolator : str or stage
         Names, or stage objects such as ``illumgrid.sampler("uniform", count=64)``.
     grid : int, optional
-        Nodes along the axis with most voxels; by default 1.2 for each voxel, at most 150.
+        Nodes along the axis with most voxels, all of which are lit. By default 0.85 for each voxel, at most 150, and
+        twice or four times as many where a first look finds rough light: see `illumgrid.bake.refined.chosen`. With
+        other stages than the default ones, or `error` or `seconds`, 1.2 for each voxel or what is chosen.
     paths : int, optional
-        Light paths from every query; by default 32.
+        Light paths from every query; by default 8 to 64, the more, the fewer nodes are lit, and 32 with `grid`.
     bounces : int, optional
         Reflections; 0 is light straight from background and lamps. By default as many as leave out less than 1 % of
-        the light, and at least 4; where it takes more, a coarse grid is lit first, and paths end in its light where
-        that is known well: see `illumgrid.bake.known.light_known_first`. A number given here is followed path by path.
+        the light, and at least 4; paths end in the light of the first look where that is known well, or, where it
+        takes more bounces, in a coarse grid that is lit first: see `illumgrid.bake.known.light_known_first`. A number
+        given here is followed path by path.
     isovalues : int, optional
         Rows of the level table, 32 by default; if given, also the count of a sampler that is named and has one.
     texels : int, optional
@@ -136,7 +144,8 @@ def run(
     cached = bool(before and before.get("cache"))
     if before:
         grid, bounces, left_out, plan = (before[key] for key in ("grid", "bounces", "left_out", "plan"))
-        walked = _gone_on_with(before, None if error or seconds else paths or PATHS)
+        again = before["paths"] if before.get("refined") else PATHS
+        walked = _gone_on_with(before, None if error or seconds else paths or again)
     elif error is not None or seconds is not None:
         progress("pilot", 0, 1)
         plan = planned(
@@ -153,27 +162,43 @@ def run(
     if not _shines(scene):
         tell("dark", "no background, lamp or surface of this scene emits light: all of it will be 0", stacklevel=2)
     specs = specs_over(scene, grid)
-    needs.check_run(scene, specs, levels, getattr(chosen[2], "density", 1.0))
+    whole = grid is not None or plan is not None or not _refinable(scene, *chosen)  # all nodes of one lattice
+    whole = whole or bool(keep and keep.at_once)
+    base = [] if (before and not before.get("refined") if before else whole) else specs_over(scene, None, BASE)
+    if base:
+        needs.check_run(scene, base, levels, 2 ** halvings(base), MOST)
+    else:
+        needs.check_run(scene, specs, levels, getattr(chosen[2], "density", 1.0))
+    automatic = bounces is None or bool(before and before.get("cache"))
     if bounces is None:
         bounces, left_out = enough_bounces(scene, tracer, seed)
         cached = bounces > MANY_BOUNCES and not (keep and keep.at_once)
         cached = cached and capabilities(chosen[1]).surface == "levelset" and hasattr(tracer, "cache")
     elif not before:
         left_out = light_left_out(scene, tracer, bounces, seed)
-    clock, gathering = time.perf_counter(), tracer
-    if cached:
-        gathering = light_known_first(
-            scene, specs, levels, tracer, bounces=bounces, seed=seed, map=map,
-            progress=lambda what, done, total: progress("first light", done, total),
-        )  # fmt: skip
-        left_out = left_out if before else light_left_out(scene, gathering, bounces, seed)
-    first = {"cache": time.perf_counter() - clock} if cached else {}
+    clock, gathering, asking, refined = time.perf_counter(), tracer, chosen[0], None
+    how: dict[str, Any] = {"seed": seed, "map": map}
+    how["progress"] = lambda what, done, total: progress("first light", done, total)
+    ends_in_look = bool(base) and automatic and not scene.quads and hasattr(tracer, "cache")
+    if cached and not ends_in_look:
+        gathering = light_known_first(scene, base or specs, levels, tracer, bounces=bounces, **how)
+    if base:
+        nodes = nodes_to_light(scene, base, halvings(base), gathering, bounces=2 * bounces, **how)
+        if ends_in_look:  # the light of the first look costs nothing more
+            cached, gathering = True, ending_in(cache_of(scene, nodes.looked, ()), tracer)
+        if paths is None and not before:
+            walked = [range(paths_for(nodes, base))]
+        specs, refined = [finer(spec, nodes.levels) for spec in base], written(nodes, base)
+        asking, chosen = Chosen(nodes.flat), (chosen[0], chosen[1], Nested(nodes.levels))
+    if cached and not before:
+        left_out = light_left_out(scene, gathering, bounces, seed)
+    first = {"look" if base else "cache": time.perf_counter() - clock} if cached or base else {}
     if keep is not None:
         fixed = None if isinstance(walked, Iterator) else max(r.stop for r in walked)
         about = {"cache": cached, "grid": grid, "bounces": bounces, "left_out": left_out, "paths": fixed}
-        keep.choose({**about, "plan": asdict(plan) if isinstance(plan, Plan) else plan})
+        keep.choose({**about, "refined": refined, "plan": asdict(plan) if isinstance(plan, Plan) else plan})
     baked = bake(
-        scene, specs, levels, chosen[0], gathering, chosen[2],
+        scene, specs, levels, asking, gathering, chosen[2],
         paths=walked, bounces=bounces, seed=seed, map=map, progress=progress, keep=keep,
     )  # fmt: skip
     _note_holes(scene, baked)
@@ -183,6 +208,7 @@ def run(
         "bounces": bounces,
         "left_out": left_out,
         "cache": cached,
+        "refined": refined and {"from": max(max(spec.shape) for spec in base), "levels": refined["levels"]},
         "isovalues": len(levels.table),
         "seed": seed,
         **_measured(baked, first),
@@ -194,6 +220,17 @@ def run(
     }
     light = Illumination(scene, levels, baked.grids, baked.walls, recipe)
     return judged(light, chosen[1], tracer) if judge else light
+
+
+def _refinable(scene: Scene, sampler: Any, backend: Any, interpolator: Any) -> bool:
+    """Whether nodes can be lit where the light is rough: with the default stages, and isovalues that sweep together."""
+    can = capabilities(backend)
+    return (
+        (sampler.name, interpolator.name) == ("direct", "nearest")
+        and can.transport
+        and can.surface == "levelset"
+        and all(field.isovalue is None for field in scene.fields)
+    )
 
 
 def _whole_numbers(paths: Any, bounces: Any, seed: Any) -> tuple[int | None, int | None, int]:

@@ -10,6 +10,9 @@ At similar cost, more accurate than 1 node per voxel with 64 paths on three of f
 smoothest; half the error on one (``benchmarks/chart.py defaults``). Nodes on voxels are the worst place for noisy data.
 """
 
+BASE, FINEST = 0.85, 300
+"""Nodes per voxel along an axis, and nodes along the longest axis at most of the finest level, where a run refines."""
+
 ON_A_VOXEL = 1e-7
 """Index coordinates this close to an integer are rounded to it: a node on a voxel remains there after a round trip
 through world coordinates, even at origins 1e5 extents away (1e5 x 128 voxels x 2.2e-16 = 3e-9)."""

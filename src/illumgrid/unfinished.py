@@ -10,13 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from illumgrid import registry
+from illumgrid.bake.refined import Chosen, read_choice
 from illumgrid.bake.targets import coarse_first, held_queries, node_queries, of_field
 from illumgrid.bake.walls import wall_queries, wall_texture
+from illumgrid.constants import BASE
 from illumgrid.errors import BadInput
 from illumgrid.field.lattice import specs_over
 from illumgrid.field.scene import finer_texels, level_table
 from illumgrid.field.volume import world_to_index
 from illumgrid.grid import IlluminationGrid, Nodes, WallTexture
+from illumgrid.grid.nested import finer
+from illumgrid.interpolators.nested import Nested
 from illumgrid.io import disk, partial, store
 from illumgrid.light import Illumination
 from illumgrid.transport.samples import Queries, Samples, combine, join_queries
@@ -59,6 +63,11 @@ def load(place: Path) -> tuple[Illumination, float]:
         )
         specs = specs_over(scene, chosen["grid"])
         levels = level_table(scene, about["isovalues"] or 32)
+        if refined := chosen.get("refined"):
+            base = specs_over(scene, None, BASE)
+            choice = read_choice(refined)
+            specs = [finer(spec, choice.levels) for spec in base]
+            sampler, interpolator = Chosen(choice.flat), Nested(choice.levels)
         nodes = node_queries(scene, specs, sampler, about["seed"])
         held = held_queries(scene, nodes)
         targets = nodes + held + wall_queries(scene, levels)

@@ -84,7 +84,7 @@ def _advise(light: "Illumination", stages: dict[str, Any]) -> None:
     if not found:
         return
     text = f"interpolation between nodes is off by about {found['now']:.1%} at any number of paths"
-    if found["finer"] < 0.8 * found["now"]:
+    if found["finer"] < 0.8 * found["now"] and not recipe["refined"]:
         text += f"; --grid {2 * recipe['grid']} would reduce that to {found['finer']:.1%}"
     if found["smooth"] < 0.8 * found["now"]:
         smooth = np.hypot(recipe.get("smooth", 0.0), 1.0)  # by a voxel more: variances of blurs add up
@@ -103,6 +103,8 @@ def again(options: str) -> str:
 
 def report(light: "Illumination", folder: Path, picture: bool) -> None:
     """Say what was computed, in which time, how far off it is and where it lies."""
+    from illumgrid.bake.known import MOST_BIAS
+
     recipe = light.recipe
     errors = [e for e in recipe["relative_error"] if e is not None]
     noise = f", noise about {max(errors):.1%} of the mean light" if errors else ""
@@ -111,6 +113,13 @@ def report(light: "Illumination", folder: Path, picture: bool) -> None:
         for sentence in plan["why"]:
             say(f"  {sentence}")
     work = f"{recipe['queries'] - recipe['texels']} queries x {recipe['paths']} paths"
+    if refined := recipe["refined"]:
+        say(
+            f"{refined['from']} nodes along the longest axis are lit"
+            + (f", and up to {recipe['grid']} where the light is rough" if refined["levels"] else "")
+        )
+    if recipe["cache"]:
+        say(f"paths end in light that is known: a bias of at most {MOST_BIAS:.1%} of the mean light on tested scenes")
     if recipe["texels"]:
         work += f" and {recipe['texels']} texels of walls x {recipe['texel_paths']} paths"
     say(f"{work} in {sum(recipe['seconds'].values()):.1f} s{noise}{omitted_light(recipe)}")

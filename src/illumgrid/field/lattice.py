@@ -64,11 +64,12 @@ class GridSpec:
         return index_to_world(self, np.stack(np.unravel_index(numbers, self.shape), axis=-1))
 
 
-def nodes_over(volume: Volume, longest: int | None = None) -> GridSpec:
+def nodes_over(volume: Volume, longest: int | None = None, density: float = DENSITY) -> GridSpec:
     """Nodes of a volume's grid; see `illumgrid.constants.DENSITY`."""
-    return GridSpec.over(volume, min(round(DENSITY * max(volume.shape)), LONGEST) if longest is None else longest)
+    usual = max(2, min(round(density * max(volume.shape)), LONGEST))
+    return GridSpec.over(volume, usual if longest is None else longest)
 
 
-def specs_over(scene: Scene, longest: int | None = None) -> list[GridSpec]:
+def specs_over(scene: Scene, longest: int | None = None, density: float = DENSITY) -> list[GridSpec]:
     """Nodes of every field's grid: see `nodes_over`."""
-    return [nodes_over(field.volume, longest) for field in scene.fields]
+    return [nodes_over(field.volume, longest, density) for field in scene.fields]

@@ -35,22 +35,23 @@ def bins(samples: Samples, nodes: Nodes) -> Bins:
     from illumgrid.grid.reading import slopes
 
     spec, volume = nodes.spec, nodes.field.volume
+    queries = samples.queries[:]  # computed once, where only numbers of nodes are kept
     count = int(np.prod(spec.shape))
-    index = world_to_index(spec, samples.queries.point)
+    index = world_to_index(spec, queries.point)
     closest = np.clip(np.round(index), 0, np.array(spec.shape) - 1).astype(np.int64)
     flat = np.ravel_multi_index(tuple(closest.T), spec.shape)
     lit = samples.paths > 0
     dark = np.zeros(count, bool)
     dark[flat[~lit & (np.abs(index - closest) < _ON_A_NODE).all(axis=1)]] = True
     good = np.flatnonzero(lit)
-    good = good[np.lexsort((samples.queries.id[good], flat[good]))]
+    good = good[np.lexsort((queries.id[good], flat[good]))]
     slope = np.zeros(len(good))
-    slopes(volume.stored, volume.spacing, spec.spacing, world_to_index(volume, samples.queries.point[good]), slope)
+    slopes(volume.stored, volume.spacing, spec.spacing, world_to_index(volume, queries.point[good]), slope)
     scale, shift = _level_units(nodes)
     place = np.column_stack(
         [
-            index[good], (volume.to_stored(samples.queries.level[good, nodes.number]) - shift) * scale,
-            samples.queries.normal[good] @ volume.direction, slope * scale,
+            index[good], (volume.to_stored(queries.level[good, nodes.number]) - shift) * scale,
+            queries.normal[good] @ volume.direction, slope * scale,
         ]
     )  # fmt: skip
     start = np.zeros(count + 1, np.int64)
@@ -95,31 +96,41 @@ class Bilateral:
 
     def fill(self, samples: Samples, nodes: Nodes) -> IlluminationGrid:
         """Fill a grid of `density` times the nodes: see `illumgrid.stages.Interpolator`."""
-        from illumgrid.grid.reading import fill
-
-        sorted_ = bins(samples, nodes)
-        spec, field = nodes.spec, nodes.field
-        dense = Nodes(denser(spec, self.density), field, nodes.number)
-        light = np.zeros((len(dense), samples.light.shape[1]), np.float32)
-        error, support = np.full(len(dense), np.inf, np.float32), np.zeros(len(dense), np.float32)
-        volume, (scale, shift) = field.volume, _level_units(nodes)
-        reached = reachable(field, dense.spec)
-        ratio = (np.array(spec.shape) - 1.0) / (np.array(volume.shape) - 1.0)
-
-        def chunk(flat: NDArray[np.int64]) -> None:
-            at = np.stack(np.unravel_index(flat, dense.spec.shape), axis=1) * (dense.spec.spacing / volume.spacing)
-            some = np.zeros((len(flat), light.shape[1]), np.float32)
-            bar, many = np.full(len(flat), np.inf, np.float32), np.zeros(len(flat), np.float32)
-            fill(
-                volume.stored, volume.spacing, field.upward, field.stored_range, scale, shift, *sorted_,
-                np.array(spec.shape), ratio, at, some, bar, many,
-            )  # fmt: skip
-            light[flat], error[flat], support[flat] = some, bar, many
-
-        chunk(reached[:0])  # compiles once, in the main thread, which Ctrl-C interrupts
-        with ThreadPoolExecutor(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else None) as pool:
-            list(pool.map(chunk, (reached[i : i + _BLOCK] for i in range(0, len(reached), _BLOCK))))
+        dense = Nodes(denser(nodes.spec, self.density), nodes.field, nodes.number)
+        light, error, support = read(samples, nodes, dense, reachable(nodes.field, dense.spec))
         return dense.grid(light, error, support, samples.channels)
+
+
+def read(
+    samples: Samples, nodes: Nodes, dense: Nodes, flat: NDArray[np.int64]
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+    """Light (n, C), error (n,) and support (n,) at all nodes of `dense`; only those with the numbers `flat` are read.
+
+    The samples lie around `nodes`, the lattice that was lit.
+    """
+    from illumgrid.grid.reading import fill
+
+    sorted_ = bins(samples, nodes)
+    spec, field = nodes.spec, nodes.field
+    light = np.zeros((len(dense), samples.light.shape[1]), np.float32)
+    error, support = np.full(len(dense), np.inf, np.float32), np.zeros(len(dense), np.float32)
+    volume, (scale, shift) = field.volume, _level_units(nodes)
+    ratio = (np.array(spec.shape) - 1.0) / (np.array(volume.shape) - 1.0)
+
+    def chunk(flat: NDArray[np.int64]) -> None:
+        at = np.stack(np.unravel_index(flat, dense.spec.shape), axis=1) * (dense.spec.spacing / volume.spacing)
+        some = np.zeros((len(flat), light.shape[1]), np.float32)
+        bar, many = np.full(len(flat), np.inf, np.float32), np.zeros(len(flat), np.float32)
+        fill(
+            volume.stored, volume.spacing, field.upward, field.stored_range, scale, shift, *sorted_,
+            np.array(spec.shape), ratio, at, some, bar, many,
+        )  # fmt: skip
+        light[flat], error[flat], support[flat] = some, bar, many
+
+    chunk(flat[:0])  # compiles once, in the main thread, which Ctrl-C interrupts
+    with ThreadPoolExecutor(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else None) as pool:
+        list(pool.map(chunk, (flat[i : i + _BLOCK] for i in range(0, len(flat), _BLOCK))))
+    return light, error, support
 
 
 def denser(spec: GridSpec, density: float) -> GridSpec:

@@ -46,10 +46,12 @@ def of_field(voxels: int, each: int) -> float:
     return each * min(voxels, _PARTS) + _BRICKS * max(0, voxels - _PARTS)
 
 
-def check_run(scene: "Scene", specs: Sequence[GridSpec], levels: "Levels", density: float = 1.0) -> None:
+def check_run(
+    scene: "Scene", specs: Sequence[GridSpec], levels: "Levels", density: float = 1.0, lit: float = 1.0
+) -> None:
     """Refuse a run whose nodes, walls and fields do not fit, and say which grid would.
 
-    The interpolator stores `density` times the nodes along each axis.
+    The interpolator stores `density` times the nodes along each axis; at most `lit` times as many are lit.
     """
     channels = len(channels_of(scene))
     each = _QUERY + _CHANNEL * channels
@@ -61,7 +63,7 @@ def check_run(scene: "Scene", specs: Sequence[GridSpec], levels: "Levels", densi
         # Light, error and support; errors of each light, or light a second time while holes are filled from the nodes
         # nearest to them. A denser grid has no errors of single lights.
         stored = 4 * channels + 8 + (4 * channels if share < 1 or density == 1 else 0) + (12 if share < 1 else 0)
-        nodes += prod(spec.shape) * (stored * density**3 + each * share)
+        nodes += prod(spec.shape) * (stored * density**3 + each * lit * share)
     longest, room = max(max(spec.shape) for spec in specs), 0.8 * free_memory() - fixed
     fits = int(longest * (max(room, 0.0) / nodes) ** (1 / 3))
     todo = "cut or downsample the volume"

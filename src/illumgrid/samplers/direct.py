@@ -63,6 +63,8 @@ class Direct:
 class NodeQueries(Queries):
     """The queries of `Direct` at nodes of one field, of which only the nodes' numbers are kept: 4 bytes each.
 
+    They are at all nodes that a sweep can reach, or at those whose numbers are given.
+
     Rows of it are plain queries; `point`, `normal` and `level` are computed anew, some nodes at a time, whenever they
     are asked for.
     """
@@ -72,8 +74,8 @@ class NodeQueries(Queries):
     spec: GridSpec
     node: NDArray[np.integer]
 
-    def __init__(self, scene: Scene, field: int, spec: GridSpec) -> None:
-        node = reachable(scene.fields[field], spec)
+    def __init__(self, scene: Scene, field: int, spec: GridSpec, node: NDArray[np.integer] | None = None) -> None:
+        node = reachable(scene.fields[field], spec) if node is None else node
         node = node.astype(np.int32) if np.prod(spec.shape) < 1 << 31 else node
         for name, value in zip(("scene", "field", "spec", "node"), (scene, field, spec, node)):
             object.__setattr__(self, name, value)
