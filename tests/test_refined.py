@@ -185,7 +185,7 @@ def test_a_refined_run_that_was_stopped_can_be_seen_and_goes_on_to_the_same_bits
     monkeypatch.setattr(walk, "GROWTH", 1.0)
     monkeypatch.setattr(partial, "EVERY", 0.0)
     monkeypatch.setattr(partial, "CHUNK", 64)
-    monkeypatch.setattr(sys.modules["illumgrid.cli.run"], "judged_light", lambda light, stages, folder: light)
+    monkeypatch.setattr(sys.modules["illumgrid.cli.outcome"], "judged_light", lambda light, stages, folder: light)
     np.save(tmp_path / "shell.npy", shell().values)
     given = ("run", "shell.npy", "--scene", "sky", "--range", "0.2", "0.8", "--paths", "2", "--isovalues", "2",
              "--no-preview")  # fmt: skip
