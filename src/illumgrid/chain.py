@@ -83,11 +83,11 @@ def run(
     sampler, backend, interpolator : str or stage
         Names, or stage objects such as ``illumgrid.sampler("uniform", count=64)``.
     grid : int, optional
-        Nodes along the axis with most voxels, all of which are lit. By default 0.85 for each voxel, at most 150, and
-        twice or four times as many where a first look finds rough light: see `illumgrid.bake.refined.chosen`. With
-        other stages than the default ones, or `error` or `seconds`, 1.2 for each voxel or what is chosen.
+        Nodes along the axis with most voxels, all of which are lit. By default 1.2 for each voxel, at most 150; under a
+        sky alone 0.85, and twice or four times as many where a first look finds rough light: see
+        `illumgrid.bake.refined.chosen`.
     paths : int, optional
-        Light paths from every query; by default 8 to 64, the more, the fewer nodes are lit, and 32 with `grid`.
+        Light paths from every query; by default 32; 8 to 64 where a first look chooses the nodes.
     bounces : int, optional
         Reflections; 0 is light straight from background and lamps. By default as many as leave out less than 1 % of
         the light, and at least 4; paths end in the light of the first look where that is known well, or, where it
@@ -226,7 +226,9 @@ def _refinable(scene: Scene, sampler: Any, backend: Any, interpolator: Any) -> b
     """Whether nodes can be lit where the light is rough: with the default stages, and isovalues that sweep together."""
     can = capabilities(backend)
     return (
-        (sampler.name, interpolator.name) == ("direct", "nearest")
+        len(layers_of(scene)) == 1  # in the studio, whose key casts sharp shadows, it gained little for more time
+        and not scene.quads
+        and (sampler.name, interpolator.name) == ("direct", "nearest")
         and can.transport
         and can.surface == "levelset"
         and all(field.isovalue is None for field in scene.fields)

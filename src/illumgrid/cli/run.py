@@ -73,7 +73,7 @@ def run(
     ] = False,
     backend: Annotated[str, typer.Option(help="Light transport: auto, numba, embree, reference.")] = "auto",
     paths: Annotated[
-        int | None, typer.Option(min=1, metavar="N", help="Paths from every query. [default: 8 to 64; 32 with --grid]")
+        int | None, typer.Option(min=1, metavar="N", help="Paths from every query. [default: 32; sky alone: 8 to 64]")
     ] = None,
     bounces: Annotated[
         int | None,
@@ -87,7 +87,7 @@ def run(
     interpolator: Annotated[str, typer.Option(help="nearest, bilateral, splat or rbf.")] = "nearest",
     grid: Annotated[
         int | None,
-        typer.Option(min=2, metavar="N", help="Nodes along the longest axis. [default: as light is rough]"),
+        typer.Option(min=2, metavar="N", help="Nodes along the longest axis. [default: 1.2 per voxel, at most 150]"),
     ] = None,
     surroundings: Annotated[
         str | None,
