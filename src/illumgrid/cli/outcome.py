@@ -84,7 +84,7 @@ def _advise(light: "Illumination", stages: dict[str, Any]) -> None:
     if not found:
         return
     text = f"interpolation between nodes is off by about {found['now']:.1%} at any number of paths"
-    if found["finer"] < 0.8 * found["now"] and not recipe["refined"]:
+    if found["finer"] < 0.8 * found["now"] and not recipe.get("refined"):
         text += f"; --grid {2 * recipe['grid']} would reduce that to {found['finer']:.1%}"
     if found["smooth"] < 0.8 * found["now"]:
         smooth = np.hypot(recipe.get("smooth", 0.0), 1.0)  # by a voxel more: variances of blurs add up
@@ -113,12 +113,12 @@ def report(light: "Illumination", folder: Path, picture: bool) -> None:
         for sentence in plan["why"]:
             say(f"  {sentence}")
     work = f"{recipe['queries'] - recipe['texels']} queries x {recipe['paths']} paths"
-    if refined := recipe["refined"]:
+    if refined := recipe.get("refined"):
         say(
             f"{refined['from']} nodes along the longest axis are lit"
             + (f", and up to {recipe['grid']} where the light is rough" if refined["levels"] else "")
         )
-    if recipe["cache"]:
+    if recipe.get("cache"):
         say(f"paths end in light that is known: a bias of at most {MOST_BIAS:.1%} of the mean light on tested scenes")
     if recipe["texels"]:
         work += f" and {recipe['texels']} texels of walls x {recipe['texel_paths']} paths"
