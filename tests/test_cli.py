@@ -182,7 +182,7 @@ def test_data_without_a_surface_are_refused(refuse, tmp_path):
 def test_a_picture_is_drawn_of_the_field_and_isovalue_asked_for(call, tmp_path):
     call("run", "nucleus", "--grid", "8", "--paths", "2", "--no-preview", "-o", "out")
     options = {
-        "middle": "", "high": "--isovalue 0.7", "named": "--field neutrons --isovalue 0.7", "local": "--local",
+        "middle": "", "high": "--isovalue 0.5", "named": "--field neutrons --isovalue 0.5", "local": "--local",
     }  # fmt: skip
     pictures = {}
     for name, more in options.items():
@@ -193,7 +193,7 @@ def test_a_picture_is_drawn_of_the_field_and_isovalue_asked_for(call, tmp_path):
     assert not np.array_equal(pictures["middle"], pictures["high"])
     assert not np.array_equal(pictures["middle"], pictures["local"])
     said = call("preview", "out", "--isovalue", "0.9", "-o", "x.png")
-    assert "note: the isovalue 0.9 lies outside the range 0.15 to 0.75" in said
+    assert "note: the isovalue 0.9 lies outside the range 0.3 to 0.6" in said
 
 
 def test_pictures_that_cannot_be_drawn_are_refused(call, refuse, tmp_path):
