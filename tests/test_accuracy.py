@@ -191,7 +191,7 @@ class Clock:
 
     def walk(self, plan, until):
         done = 0
-        for numbers in rounds(plan, until, self):
+        for numbers in rounds(plan.paths, plan.fill, until, self):
             assert numbers.start == done  # one after the other, none twice
             done = numbers.stop
             self.now += len(numbers) * self.pace(self.now)

@@ -3,7 +3,7 @@
 import operator
 import os
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, replace
 from importlib.metadata import version
 from typing import Any
@@ -11,29 +11,27 @@ from typing import Any
 import numpy as np
 
 from illumgrid import registry
-from illumgrid.accuracy.choose import JUDGED, Plan, planned
+from illumgrid.accuracy.choose import JUDGED, planned
 from illumgrid.accuracy.judge import judge as measure_error
 from illumgrid.accuracy.judge import judge_walls as measure_walls
 from illumgrid.accuracy.probe import FEWEST_PATHS, MOST_PATHS
 from illumgrid.bake import Baked, bake
 from illumgrid.bake.accumulator import Map, Progress
+from illumgrid.bake.ahead import light_ahead
 from illumgrid.bake.bounces import enough_bounces, light_left_out
-from illumgrid.bake.known import light_known_first
-from illumgrid.bake.refined import MOST, Chosen, paths_for, written
-from illumgrid.bake.refined import chosen as nodes_to_light
+from illumgrid.bake.refined import MOST
 from illumgrid.constants import BASE, PATHS
 from illumgrid.errors import BadInput, tell, tell_after
 from illumgrid.field.lattice import specs_over
 from illumgrid.field.layers import layers_of
-from illumgrid.field.scene import Scene, finer_texels, level_table, with_texels
-from illumgrid.grid.cache import cache_of
-from illumgrid.grid.nested import finer, halvings
-from illumgrid.interpolators.nested import Nested
+from illumgrid.field.scene import Levels, Scene, finer_texels, level_table, with_texels
+from illumgrid.grid import GridSpec
+from illumgrid.grid.nested import halvings
 from illumgrid.io import needs, store
 from illumgrid.light import Illumination
 from illumgrid.stages import Backend, Interpolator, Sampler
 from illumgrid.transport.stages import capabilities
-from illumgrid.transport.tracer import Tracer, ending_in, prepare
+from illumgrid.transport.tracer import Tracer, prepare
 from illumgrid.transport.walk import RunKeeper
 
 MANY_BOUNCES = 4
@@ -135,84 +133,67 @@ def run(
     if isovalues is not None and isinstance(sampler, str) and "count" in registry.option_names("sampler", sampler):
         options["count"] = isovalues
     chosen = _stage("sampler", sampler, options), _stage("backend", backend), _stage("interpolator", interpolator)
-    plan: Any = None
     begun, tracer = time.perf_counter(), prepare(chosen[1], scene)
-    walked: Iterable[range] = [range(PATHS if paths is None else paths)]
-    left_out, before = 0.0, None if keep is None else keep.chosen
+    before = None if keep is None else keep.chosen
     if error is not None or seconds is not None:
         _check_plannable(error, seconds, *chosen)
-    cached = bool(before and before.get("cache"))
+    cached, left_out = bool(before and before.get("cache")), 0.0
+    plan: Any = None
     if before:
         grid, bounces, left_out, plan = (before[key] for key in ("grid", "bounces", "left_out", "plan"))
-        again = before["paths"] if before.get("refined") else PATHS
-        walked = _gone_on_with(before, None if error or seconds else paths or again)
     elif error is not None or seconds is not None:
-        progress("pilot", 0, 1)
-        plan = planned(
-            scene, tracer, levels, error=error, seconds=seconds, grid=grid, paths=paths, bounces=bounces,
+        plan = _planned(
+            scene, tracer, levels, progress, error=error, seconds=seconds, grid=grid, paths=paths, bounces=bounces,
             texels=texels, seed=seed,
         )  # fmt: skip
-        progress("pilot", 1, 1)
-        if plan.outlook:
-            tell("plan", plan.outlook, stacklevel=2)
-        grid, bounces = plan.grid, plan.bounces
-        walked = [range(plan.paths)] if seconds is None or paths is not None else rounds(plan, begun + seconds)
-    if plan:
-        scene = finer_texels(scene, plan.finer if isinstance(plan, Plan) else plan.get("finer", 1.0))
+        grid, bounces = plan["grid"], plan["bounces"]
+    scene = finer_texels(scene, plan.get("finer", 1.0)) if plan else scene
     if not _shines(scene):
         tell("dark", "no background, lamp or surface of this scene emits light: all of it will be 0", stacklevel=2)
-    specs = specs_over(scene, grid)
-    whole = grid is not None or plan is not None or not _refinable(scene, *chosen)  # all nodes of one lattice
-    whole = whole or bool(keep and keep.at_once)
-    base = [] if (before and not before.get("refined") if before else whole) else specs_over(scene, None, BASE)
-    if base:
-        needs.check_run(scene, base, levels, 2 ** halvings(base), MOST)
+    at_once = bool(keep and keep.at_once)
+    refining = before.get("refined") if before else not (at_once or grid or plan) and _refinable(scene, *chosen)
+    specs = specs_over(scene, None, BASE) if refining else specs_over(scene, grid)
+    if refining:
+        needs.check_run(scene, specs, levels, 2 ** halvings(specs), MOST)
     else:
         needs.check_run(scene, specs, levels, getattr(chosen[2], "density", 1.0))
-    automatic = bounces is None or bool(before and before.get("cache"))
+    automatic = bounces is None or cached
     if bounces is None:
         bounces, left_out = enough_bounces(scene, tracer, seed)
-        cached = bounces > MANY_BOUNCES and not (keep and keep.at_once)
-        cached = cached and capabilities(chosen[1]).surface == "levelset" and hasattr(tracer, "cache")
+        marches = capabilities(chosen[1]).surface == "levelset" and hasattr(tracer, "cache")
+        cached = bounces > MANY_BOUNCES and not at_once and marches
     elif not before:
         left_out = light_left_out(scene, tracer, bounces, seed)
-    clock, gathering, asking, refined = time.perf_counter(), tracer, chosen[0], None
-    how: dict[str, Any] = {"seed": seed, "map": map}
-    how["progress"] = lambda what, done, total: progress("first light", done, total)
-    ends_in_look = bool(base) and automatic and not scene.quads and hasattr(tracer, "cache")
-    if cached and not ends_in_look:
-        gathering = light_known_first(scene, base or specs, levels, tracer, bounces=bounces, **how)
-    if base:
-        nodes = nodes_to_light(scene, base, halvings(base), gathering, bounces=2 * bounces, **how)
-        if ends_in_look:  # the light of the first look costs nothing more
-            cached, gathering = True, ending_in(cache_of(scene, nodes.looked, ()), tracer)
-        if paths is None and not before:
-            walked = [range(paths_for(nodes, base))]
-        specs, refined = [finer(spec, nodes.levels) for spec in base], written(nodes, base)
-        asking, chosen = Chosen(nodes.flat), (chosen[0], chosen[1], Nested(nodes.levels))
-    if cached and not before:
-        left_out = light_left_out(scene, gathering, bounces, seed)
-    first = {"look" if base else "cache": time.perf_counter() - clock} if cached or base else {}
+    clock = time.perf_counter()
+    ahead = light_ahead(
+        scene, specs, levels, tracer, chosen, refining=bool(refining), cached=cached, automatic=automatic,
+        bounces=bounces, seed=seed, map=map, progress=lambda what, done, total: progress("first light", done, total),
+    )  # fmt: skip
+    first = {ahead.name: time.perf_counter() - clock} if ahead.name else {}
+    if ahead.cached and not before:
+        left_out = light_left_out(scene, ahead.tracer, bounces, seed)
+    walked = _paths_of(before, plan, paths, error, seconds, begun, ahead.paths)
     if keep is not None:
         fixed = None if isinstance(walked, Iterator) else max(r.stop for r in walked)
-        about = {"cache": cached, "grid": grid, "bounces": bounces, "left_out": left_out, "paths": fixed}
-        keep.choose({**about, "refined": refined, "plan": asdict(plan) if isinstance(plan, Plan) else plan})
+        about = {"cache": ahead.cached, "grid": grid, "bounces": bounces, "left_out": left_out, "paths": fixed}
+        keep.choose({**about, "refined": ahead.refined, "plan": plan})
     baked = bake(
-        scene, specs, levels, asking, gathering, chosen[2],
+        scene, ahead.specs, levels, ahead.sampler, ahead.tracer, ahead.interpolator,
         paths=walked, bounces=bounces, seed=seed, map=map, progress=progress, keep=keep,
     )  # fmt: skip
     _note_holes(scene, baked)
+    stages = chosen[0], chosen[1], ahead.interpolator
     recipe = {
-        **{kind: _described(stage) for kind, stage in zip(("sampler", "backend", "interpolator"), chosen)},
-        "grid": max(max(spec.shape) for spec in specs),
+        **{kind: _described(stage) for kind, stage in zip(("sampler", "backend", "interpolator"), stages)},
+        "grid": _longest(ahead.specs),
         "bounces": bounces,
         "left_out": left_out,
-        "cache": cached,
-        "refined": refined and {"from": max(max(spec.shape) for spec in base), "levels": refined["levels"]},
+        "cache": ahead.cached,
+        "refined": ahead.refined and {"from": _longest(specs), "levels": ahead.refined["levels"]},
         "isovalues": len(levels.table),
         "seed": seed,
         **_measured(baked, first),
-        "plan": asdict(plan) if isinstance(plan, Plan) else plan,
+        "plan": plan,
         "reached": None,
         "reached_uncertain": None,
         "reached_on_walls": None,
@@ -220,6 +201,33 @@ def run(
     }
     light = Illumination(scene, levels, baked.grids, baked.walls, recipe)
     return judged(light, chosen[1], tracer) if judge else light
+
+
+def _longest(specs: Sequence[GridSpec]) -> int:
+    return max(max(spec.shape) for spec in specs)
+
+
+def _planned(scene: Scene, tracer: Tracer, levels: Levels, progress: Progress, **asked: Any) -> dict[str, Any]:
+    """What a pilot chooses for an error or a time, as `Plan` has it; what the user should know is said."""
+    progress("pilot", 0, 1)
+    plan = planned(scene, tracer, levels, **asked)
+    progress("pilot", 1, 1)
+    if plan.outlook:
+        tell("plan", plan.outlook, stacklevel=3)
+    return asdict(plan)
+
+
+def _paths_of(
+    before: dict[str, Any] | None, plan: Any, paths: int | None, error: float | None, seconds: float | None,
+    begun: float, few: int,
+) -> Iterable[range]:  # fmt: skip
+    """Numbers of the paths to walk: `few` where nothing else is said."""
+    if before:
+        again = before["paths"] if before.get("refined") else PATHS
+        return _gone_on_with(before, None if error or seconds else paths or again)
+    if plan and seconds is not None and paths is None:
+        return rounds(plan["paths"], plan["fill"], begun + seconds)
+    return [range(plan["paths"] if plan else paths or few)]
 
 
 def _refinable(scene: Scene, sampler: Any, backend: Any, interpolator: Any) -> bool:
@@ -334,14 +342,14 @@ def _shines(scene: Scene) -> bool:
     return any(any(layer.color) for layer in layers_of(scene))
 
 
-def rounds(plan: Plan, until: float, clock: Callable[[], float] = time.perf_counter) -> Iterator[range]:
+def rounds(paths: int, fill: float, until: float, clock: Callable[[], float] = time.perf_counter) -> Iterator[range]:
     """Paths for a run that is to end at a time: a quarter of the plan's, then as many as their pace leaves time for.
 
     The probe times a few thousand paths, which is good enough to choose a grid but, on a machine that does other things
     as well, not to promise a time.
     """
-    begun, done, more = clock(), 0, max(FEWEST_PATHS, 2 * (plan.paths // 8))
-    after = plan.fill + (1 - JUDGED) * (until - begun)
+    begun, done, more = clock(), 0, max(FEWEST_PATHS, 2 * (paths // 8))
+    after = fill + (1 - JUDGED) * (until - begun)
     while more >= max(2, done // 16) and done < MOST_PATHS:
         yield range(done, done + more)
         done += more

@@ -1,0 +1,50 @@
+"""What is lit ahead of a bake: a coarse grid in whose light paths end, a look that chooses the nodes, or nothing."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from illumgrid.bake.known import light_known_first
+from illumgrid.bake.refined import Chosen, chosen, paths_for, written
+from illumgrid.constants import PATHS
+from illumgrid.field.scene import Levels, Scene
+from illumgrid.grid import GridSpec
+from illumgrid.grid.cache import cache_of
+from illumgrid.grid.nested import finer, halvings
+from illumgrid.interpolators.nested import Nested
+from illumgrid.stages import Interpolator, Sampler
+from illumgrid.transport.tracer import Tracer, ending_in
+
+
+@dataclass(frozen=True, eq=False)
+class Ahead:
+    """What a bake asks and by what, and what was lit ahead of it."""
+
+    specs: Sequence[GridSpec]
+    sampler: Sampler
+    tracer: Tracer
+    interpolator: Interpolator
+    cached: bool = False  # whether paths end in light that is known
+    refined: dict[str, Any] | None = None  # the nodes that a first look chose
+    paths: int = PATHS
+    name: str = ""  # of what was lit ahead
+
+
+def light_ahead(
+    scene: Scene, specs: Sequence[GridSpec], levels: Levels, tracer: Tracer, stages: tuple[Any, Any, Any], *,
+    refining: bool, cached: bool, automatic: bool, bounces: int, **how: Any,
+) -> Ahead:  # fmt: skip
+    """A coarse grid in whose light paths end, a first look that chooses the nodes, both, or neither."""
+    in_look = refining and automatic and hasattr(tracer, "cache")  # its light costs nothing more
+    ending = tracer
+    if cached and not in_look:
+        ending = light_known_first(scene, specs, levels, tracer, bounces=bounces, **how)
+    if not refining:
+        return Ahead(specs, stages[0], ending, stages[2], cached, name="cache" if cached else "")
+    nodes = chosen(scene, specs, halvings(specs), ending, bounces=2 * bounces, **how)
+    if in_look:
+        ending = ending_in(cache_of(scene, nodes.looked, ()), tracer)
+    return Ahead(
+        [finer(spec, nodes.levels) for spec in specs], Chosen(nodes.flat), ending, Nested(nodes.levels),
+        cached or in_look, written(nodes, specs), paths_for(nodes, specs), "look",
+    )  # fmt: skip
