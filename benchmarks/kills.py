@@ -111,7 +111,21 @@ def start(folder, command, which):
     text = [part.format(which) for part in command.arguments]
     environment = {**os.environ, "TMPDIR": str(folder / "temporary")}
     run = [sys.executable, "-m", "illumgrid", *text]
-    return subprocess.Popen(run, cwd=folder, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    with said(folder).open("wb") as stderr:
+        return subprocess.Popen(run, cwd=folder, env=environment, stdout=subprocess.DEVNULL, stderr=stderr)
+
+
+def said(folder):
+    """What a process in a folder wrote to its standard error: a file beside the folder."""
+    return folder.with_name(f"{folder.name}.said")
+
+
+def not_begun(folder, ended, signals):
+    """Whether a process ended before it ran illumgrid: Python at its own start dies of a signal, or exits with 1."""
+    text = said(folder).read_bytes()
+    return ended == -signals or (
+        ended == 1 and (text.startswith(b"Fatal Python error: init") or b"runpy module" in text)
+    )
 
 
 def hidden(folder):
@@ -200,7 +214,7 @@ def stop(folder, command, known, finished, late, signals, chance):
         found = "absent between two renames, both results complete beside it"
         (hide,) = left
         assert one_light(hide / "old", known.old) and one_light(hide / "new", known.new)
-    elif signals != signal.SIGKILL and ended == -signals:
+    elif signals != signal.SIGKILL and not_begun(folder, ended, signals):
         found += ", the interpreter had not begun to run illumgrid"
         assert at == ("old" if finished else None), f"exit {ended}"
     elif signals != signal.SIGKILL:
