@@ -139,6 +139,10 @@ class NumbaTracer:
             yield meshed(self.fields, self.meshes.of(row)), members
 
 
+LOOK = 0.2
+"""Seconds after which a wait looks for Ctrl-C: a signal that comes just before the system call does not end it."""
+
+
 def beside(work: Callable[[], None]) -> None:
     """Do work that cannot be stopped, such as compilation, in another thread; Ctrl-C ends only the wait for it."""
     trouble: list[BaseException] = []
@@ -151,7 +155,8 @@ def beside(work: Callable[[], None]) -> None:
 
     thread = threading.Thread(target=do, daemon=True)  # at the end of the process it is not waited for
     thread.start()
-    thread.join()
+    while thread.is_alive():
+        thread.join(LOOK)
     if trouble:
         raise trouble[0]
 
@@ -188,7 +193,7 @@ def share(
 
     def until(most: int) -> None:
         while len(waiting) > most:
-            for future in wait(waiting, return_when=FIRST_COMPLETED).done:
+            for future in wait(waiting, LOOK, FIRST_COMPLETED).done:
                 future.result()
                 report(waiting.pop(future))
 
