@@ -195,6 +195,12 @@ def test_overwrite_begins_anew_and_leaves_nothing_of_the_other_run(call, pieces,
     assert not (tmp_path / "out.partial").exists()
 
 
+def test_a_short_run_removes_what_a_killed_one_left(call, tmp_path):
+    (tmp_path / ".out.partial-abcdef12" / "new").mkdir(parents=True)
+    call(*RUN, "--paths", "1", "-o", "out")
+    assert {p.name for p in tmp_path.iterdir()} == {"v.npy", "out"}
+
+
 def test_two_processes_do_not_work_on_one_partial_run(call, pieces):
     pieces(3)
     call(*RUN, "--paths", "4", "-o", "out", code=130)

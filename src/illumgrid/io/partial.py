@@ -135,6 +135,7 @@ class Partial:
         self, folder: Path, about: Record, command: str, scene: Callable[[Path], None] = lambda folder: None
     ) -> None:
         self.place = beside(folder)
+        disk.sweep(self.place)  # a short run writes nothing, and would leave what killed ones left
         self.about, self.command, self.write_scene = about, command, scene
         self.chosen: Record | None = None  # by the run that is gone on with: grid, bounces, walked...
         self.moments: list[Answer] = []
