@@ -1,8 +1,11 @@
 """The race and what is made of it."""
 
 import csv
+import importlib.machinery
 import itertools
 import json
+import sys
+import types
 import warnings
 from dataclasses import dataclass, replace
 from types import SimpleNamespace
@@ -11,7 +14,7 @@ from typing import ClassVar
 import numpy as np
 import pytest
 
-from illumgrid import registry
+from illumgrid import registry, run
 from illumgrid.accuracy import chart as benches
 from illumgrid.accuracy import cost
 from illumgrid.accuracy.chart import _references, _remarks, _show_default, _thinned, _tracer_of, bench, contestants
@@ -395,3 +398,19 @@ def test_of_fields_of_different_size_the_marked_setting_lights_the_nodes_of_each
         assert [p.default for p in race.points] == [True]
         assert race.points[0].queries == nodes and race.points[0].longest == 14
     assert [max(spec.shape) for spec in specs] == [14, 7]
+
+
+def test_pictures_of_grids_are_compared_with_one_of_traced_light(monkeypatch):
+    """FLIP itself is an extra; here the mean difference stands for it."""
+    from illumgrid.show import difference
+
+    flip = types.ModuleType("flip_evaluator")
+    flip.__spec__ = importlib.machinery.ModuleSpec("flip_evaluator", None)
+    flip.evaluate = lambda one, other, *_, **__: (None, float(np.abs(one - other).mean()), None)
+    monkeypatch.setitem(sys.modules, "flip_evaluator", flip)
+    monkeypatch.setattr(difference, "PATHS", 2)
+    paths = 2 * difference.SIDE**2 * 50**2 * (4 / 3) * 0.4  # for a picture of 64 x 48
+    compare = difference.studio(SCENE, TRACER, 1.0, 2, 0, paths)
+    grids = list(run(SCENE, grid=12, paths=16, bounces=2).grids)
+    dark = [replace(grid, values=np.zeros_like(grid.light)) for grid in grids]
+    assert compare(grids) < 0.02 < compare(dark)

@@ -39,9 +39,9 @@ class Traced:
     bounces: int
     seed: int
 
-    def lookup(self, points: Floats) -> NDArray[np.float32]:
-        """Irradiance (n, 3) on the level set of the picture."""
-        level = self.scene.levels(PLACE)[0, self.field]
+    def lookup(self, points: Floats, t: float = PLACE) -> NDArray[np.float32]:
+        """Irradiance (n, 3) on the level set of the picture, at `t` in the sweep."""
+        level = self.scene.levels(t)[0, self.field]
         asked = Queries.at(self.scene, points, field=self.field, level=level)
         return self.tracer.solve(asked, paths=range(PATHS), bounces=self.bounces, seed=self.seed).mean
 
