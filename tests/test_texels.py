@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import illumgrid as ig
-from illumgrid.accuracy.texels import Around, walls_for
+from illumgrid.accuracy.texels import texels_around, walls_for
 from illumgrid.accuracy.walls import unseen_on_walls
 from illumgrid.bake.walls import wall_queries
 from illumgrid.field.scene import finer_texels, level_table, with_texels
@@ -22,7 +22,7 @@ def room():
 def test_the_texels_around_a_point_hold_what_a_texture_looks_up(room):
     scene, levels, _ = room
     asked = unseen_on_walls(scene, 60, 3)
-    around = Around.of(scene, levels, asked)
+    around = texels_around(scene, levels, asked)
     whole = join_queries(wall_queries(scene, levels))
     place = {int(number): row for row, number in enumerate(whole.id)}
     rows = [place[int(number)] for number in around.asked.id]
@@ -39,7 +39,7 @@ def test_the_texels_around_a_point_hold_what_a_texture_looks_up(room):
         at = asked.point[own] - quad.corner
         u, v = (at @ edge / (edge @ edge) for edge in (quad.edge_u, quad.edge_v))
         expected[own] = texture.lookup(u, v, scene.fields[0].place(asked.level[own, 0]))
-    np.testing.assert_allclose(around.read(samples), expected, atol=1e-6)
+    np.testing.assert_allclose(around.read(samples)[0], expected, atol=1e-6)
 
 
 def test_walls_get_the_texels_that_an_error_takes_and_no_more(room):

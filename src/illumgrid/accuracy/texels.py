@@ -7,16 +7,15 @@ points are lit, and what they hold there is compared with the light at the point
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from illumgrid.accuracy.reference import begin
 from illumgrid.accuracy.walls import unseen_on_walls
 from illumgrid.bake.accumulator import Bake
 from illumgrid.bake.walls import at_texels, place_on_walls
 from illumgrid.field.scene import Levels, Scene, finer_texels
-from illumgrid.field.volume import Floats
 from illumgrid.rng import shifted_seed
-from illumgrid.transport.samples import Queries, Samples, join_queries
+from illumgrid.samplers.direct import Corners
+from illumgrid.transport.samples import Queries, join_queries
 from illumgrid.transport.tracer import Tracer
 
 FINER = (1.0, 2**0.5, 2.0, 8**0.5, 4.0)
@@ -26,38 +25,22 @@ SHARE = 0.7  # of the asked error that texels may be off: the rest is noise
 GAIN = 0.9  # of the error of coarser texels, above which finer ones are not worth their time
 
 
-@dataclass(frozen=True, eq=False)
-class Around:
-    """The eight texels around each of some points, and their weights."""
-
-    asked: Queries
-    where: NDArray[np.intp]  # (n, 8) rows of `asked`
-    weight: Floats  # (n, 8)
-
-    @classmethod
-    def of(cls, scene: Scene, levels: Levels, points: Queries) -> "Around":
-        """Those that a lookup at points on walls reads."""
-        quad, u, v, t = place_on_walls(scene, points)
-        texels = np.array([wall.texels for wall in scene.quads])[quad]
-        size = np.stack([np.full(len(quad), len(levels.table)), texels[:, 1], texels[:, 0]], axis=1)
-        place = np.stack([t * (size[:, 0] - 1), v * size[:, 1] - 0.5, u * size[:, 2] - 0.5], axis=1)
-        place = np.clip(place, 0, size - 1)
-        low = np.floor(place).astype(np.int64)
-        share, step = place - low, np.array(list(np.ndindex(2, 2, 2)))
-        corner = np.minimum(low[:, None] + step, size[:, None] - 1)
-        weight = np.where(step == 1, share[:, None], 1 - share[:, None]).prod(axis=2)
-        flat = (corner[..., 0] * size[:, None, 1] + corner[..., 1]) * size[:, None, 2] + corner[..., 2]
-        key, where = np.unique(flat | quad[:, None] << 40, return_inverse=True)
-        own, number = key & (1 << 40) - 1, key >> 40
-        asked = join_queries([at_texels(scene, levels, int(k), own[number == k]) for k in np.unique(number)])
-        return cls(asked, where.reshape(weight.shape), weight)
-
-    def read(self, samples: Samples) -> Floats:
-        """What textures with this light at their texels hold at the points, (n, 3); texels in solids give nothing."""
-        weight = self.weight * (samples.paths[self.where] > 0)
-        total = weight.sum(axis=1, keepdims=True)
-        light = (weight[..., None] * samples.mean[self.where]).sum(axis=1)
-        return np.asarray(light / np.where(total > 0, total, 1.0), float)
+def texels_around(scene: Scene, levels: Levels, points: Queries) -> Corners:
+    """The eight texels that a lookup at each of some points on walls reads."""
+    quad, u, v, t = place_on_walls(scene, points)
+    texels = np.array([wall.texels for wall in scene.quads])[quad]
+    size = np.stack([np.full(len(quad), len(levels.table)), texels[:, 1], texels[:, 0]], axis=1)
+    place = np.stack([t * (size[:, 0] - 1), v * size[:, 1] - 0.5, u * size[:, 2] - 0.5], axis=1)
+    place = np.clip(place, 0, size - 1)
+    low = np.floor(place).astype(np.int64)
+    share, step = place - low, np.array(list(np.ndindex(2, 2, 2)))
+    corner = np.minimum(low[:, None] + step, size[:, None] - 1)
+    weight = np.where(step == 1, share[:, None], 1 - share[:, None]).prod(axis=2)
+    flat = (corner[..., 0] * size[:, None, 1] + corner[..., 1]) * size[:, None, 2] + corner[..., 2]
+    key, where = np.unique(flat | quad[:, None] << 40, return_inverse=True)
+    own, number = key & (1 << 40) - 1, key >> 40
+    asked = join_queries([at_texels(scene, levels, int(k), own[number == k]) for k in np.unique(number)])
+    return Corners(asked, where.reshape(weight.shape), weight, len(asked))
 
 
 @dataclass(frozen=True)
@@ -80,9 +63,9 @@ def walls_for(scene: Scene, tracer: Tracer, levels: Levels, bounces: int, error:
         return None
     seeds, tried = (seed, shifted_seed(seed, 2**62)), list[Walls]()
     for finer in FINER:
-        around = Around.of(finer_texels(scene, finer), levels, truth.queries)
+        around = texels_around(finer_texels(scene, finer), levels, truth.queries)
         one, other = (
-            around.read(Bake.of([around.asked], bounces, s).walk(tracer, range(PATHS)).samples) - truth.light
+            around.read(Bake.of([around.asked], bounces, s).walk(tracer, range(PATHS)).samples)[0] - truth.light
             for s in seeds
         )
         # The noise of the two cancels in their product; the reference's own is in both.

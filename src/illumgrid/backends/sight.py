@@ -4,7 +4,6 @@ Light paths know nothing of coats. As `kernels`, these are serial, and depend on
 """
 
 import numpy as np
-from numba.extending import register_jitable
 
 from illumgrid import constants
 from illumgrid.backends import gathering, kernels, lights, march, simd, surfaces
@@ -26,10 +25,7 @@ from illumgrid.backends.mesh import bvh
 from illumgrid.backends.mesh import cast as mesh_cast
 from illumgrid.backends.simd import cached
 from illumgrid.constants import BURIED, CAP, MISS, MOST_FILMS, NOWHERE, QUAD, SURFACE
-from illumgrid.rng import draw, draw_pair, mix, stream
-
-for _function in (mix, stream, draw, draw_pair):
-    register_jitable(_function)
+from illumgrid.rng import draw, draw_pair, stream
 
 _SOURCES = kernels, gathering, lights, march, simd, surfaces, bvh, mesh_cast, constants
 jit = cached(*_SOURCES, _nrt=False)  # as in `march`

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from illumgrid.bake.known import light_known_first
-from illumgrid.bake.refined import Chosen, chosen, paths_for, written
+from illumgrid.bake.refined import ROUGH, Chosen, chosen, paths_for, written
 from illumgrid.constants import PATHS
 from illumgrid.field.scene import Levels, Scene
 from illumgrid.grid import GridSpec
@@ -43,7 +43,7 @@ def light_ahead(
         return Ahead(specs, stages[0], ending, stages[2], cached, name="cache" if cached else "")
     nodes = chosen(scene, specs, halvings(specs), ending, bounces=2 * bounces, **how)
     if in_look:
-        ending = ending_in(cache_of(scene, nodes.looked, ()), tracer)
+        ending = ending_in(cache_of(scene, nodes.looked, (), ROUGH), tracer)  # what is lit more finely ends none
     return Ahead(
         [finer(spec, nodes.levels) for spec in specs], Chosen(nodes.flat), ending, Nested(nodes.levels),
         cached or in_look, written(nodes, specs), paths_for(nodes, specs), "look",
