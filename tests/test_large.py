@@ -8,8 +8,9 @@ from illumgrid.field import boundaries, bricks, diagnosis
 from illumgrid.field.boundaries import suggest_range
 from illumgrid.field.bricks import lay_bricks
 from illumgrid.field.coarse import block_means
-from illumgrid.field.diagnosis import diagnose, plateaus, turning
+from illumgrid.field.diagnosis import diagnose, turning
 from illumgrid.field.lattice import nodes_over
+from illumgrid.field.plateaus import plateaus
 from illumgrid.field.scene import Field
 from illumgrid.field.volume import Volume, histogram, interpolate, slabs, world_to_index
 from illumgrid.grid.nodes import reachable

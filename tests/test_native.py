@@ -13,9 +13,10 @@ from illumgrid.backends.reference import Reference
 from illumgrid.field import bricks, levelset
 from illumgrid.field.boundaries import suggest_magnitudes, suggest_range
 from illumgrid.field.coarse import block_means
-from illumgrid.field.diagnosis import critical_isovalues, diagnose, plateaus, turning
+from illumgrid.field.diagnosis import critical_isovalues, diagnose, turning
 from illumgrid.field.lattice import nodes_over
 from illumgrid.field.levelset import isosurface, marchable
+from illumgrid.field.plateaus import plateaus
 from illumgrid.field.scene import Field, Scene
 from illumgrid.field.storing import NATIVE
 from illumgrid.field.volume import Volume, histogram, interpolate, outward_normals, project, smooth

@@ -7,8 +7,9 @@ import pytest
 
 import illumgrid as ig
 from illumgrid.errors import BadInput, shown, shown_range
-from illumgrid.field.diagnosis import critical_isovalues, diagnose, plateaus
+from illumgrid.field.diagnosis import critical_isovalues, diagnose
 from illumgrid.field.lattice import GridSpec
+from illumgrid.field.plateaus import plateaus
 from illumgrid.field.storing import NATIVE
 from illumgrid.field.volume import interpolate
 from illumgrid.samplers.adaptive import adaptive_rows

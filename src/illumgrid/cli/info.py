@@ -68,9 +68,10 @@ def info(
 def _describe_volume(source: str, limits: tuple[float, float] | None, inside: "Side", reading: dict[str, Any]) -> None:
     from illumgrid.errors import BadInput, shown, shown_range, tell
     from illumgrid.field.boundaries import has_both_signs, suggest_magnitudes, suggest_range
-    from illumgrid.field.diagnosis import critical_isovalues, diagnose, plateaus
+    from illumgrid.field.diagnosis import critical_isovalues, diagnose
     from illumgrid.field.labels import around_zero
     from illumgrid.field.lattice import nodes_over
+    from illumgrid.field.plateaus import plateaus
     from illumgrid.field.scene import Field
     from illumgrid.field.volume import finite, histogram
     from illumgrid.io import needs, store

@@ -15,10 +15,10 @@ from illumgrid.errors import shown, shown_range
 from illumgrid.field.coarse import block_means
 from illumgrid.field.labels import labels_in
 from illumgrid.field.lattice import GridSpec
+from illumgrid.field.plateaus import FEWEST, Plateau, plateaus
 from illumgrid.field.scene import Field
-from illumgrid.field.volume import Floats, Volume, index_to_world, interpolate, outward_normals, slabs
+from illumgrid.field.volume import Floats, Volume, interpolate, outward_normals, slabs
 
-_PLATEAU = 27  # flat cells that hang together: fewer are what integers do at every maximum
 _LEVELS = 64  # isovalues at which components, cavities and tunnels are counted
 _COUNTED = ("components", "tunnels", "cavities")
 _SIDE = 64  # voxels along the longest axis of the field on which they are counted
@@ -56,79 +56,6 @@ class Finding:
     name: str
     sentence: str
     options: str = ""
-
-
-Plateau = tuple[float, float, Floats]
-"""Value, share of all cells, and the world position (3,) of a cell of the largest piece."""
-
-
-def plateaus(volume: Volume) -> list[Plateau]:
-    """Values on which the field is flat over `_PLATEAU` cells or more that hang together, lowest first.
-
-    Returns
-    -------
-    list of Plateau
-    """
-    v = volume.stored
-    size, first = _flat_pieces(v)
-    large = np.flatnonzero(size >= _PLATEAU)
-    if not len(large):
-        return []
-    cells = (volume.shape[0] - 1, volume.shape[1] - 1, volume.shape[2] - 1)
-    place = np.stack(np.unravel_index(first[large], cells), axis=1)
-    value = volume.in_units(v[tuple(place.T)].astype(float))
-    found = []
-    for level in np.unique(value):
-        own = value == level
-        at = index_to_world(volume, place[own][np.argmax(size[large[own]])][None] + 0.5)[0]
-        found.append((float(level), float(size[large[own]].sum() / np.prod(cells, dtype=float)), at))
-    return found
-
-
-def _flat_pieces(v: NDArray[Any]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Cells in each piece of flat cells that hang together, and the flat number of its first; in the order of those.
-
-    Slab by slab: pieces that meet at the plane between two slabs are joined in the end.
-    """
-    from scipy.ndimage import label
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
-    sizes, firsts, joins = [], [], []
-    before, known, layer = np.zeros(0, np.int64), 0, (v.shape[1] - 1) * (v.shape[2] - 1)
-    for rows in slabs((v.shape[0] - 1, *v.shape[1:])):
-        flat = _flat_cells(v[rows.start : rows.stop + 1])
-        piece, count = label(flat)
-        cells = np.flatnonzero(flat)
-        number = piece.reshape(-1)[cells] - 1
-        first = np.empty(count, np.int64)
-        first[number[::-1]] = cells[::-1]  # of several that are written, the last remains
-        sizes.append(np.bincount(number, minlength=count))
-        firsts.append(first + rows.start * layer)
-        here = np.where(piece > 0, piece + (known - 1), -1)
-        if len(before):
-            both = (before >= 0) & (here[0] >= 0)
-            joins.append(np.stack([before[both], here[0][both]]))
-        before, known = here[-1], known + count
-    size, start = np.concatenate(sizes), np.concatenate(firsts)
-    pairs = np.concatenate([np.zeros((2, 0), np.int64), *joins], axis=1)
-    if not pairs.size:
-        return size, start
-    links = coo_array((np.ones(pairs.shape[1], bool), (pairs[0], pairs[1])), shape=(known, known))
-    count, whole = connected_components(links, directed=False)
-    earliest = np.full(count, np.iinfo(np.int64).max)
-    np.minimum.at(earliest, whole, start)
-    order = np.argsort(earliest)
-    return np.bincount(whole, size, count).astype(np.int64)[order], earliest[order]
-
-
-def _flat_cells(v: NDArray[Any]) -> NDArray[np.bool_]:
-    """Cells whose eight corners are equal."""
-    x, y, z = v[1:] == v[:-1], v[:, 1:] == v[:, :-1], v[:, :, 1:] == v[:, :, :-1]
-    flat: NDArray[np.bool_] = z[:-1, :-1] & z[1:, :-1]
-    for edges in (z[:-1, 1:], z[1:, 1:], y[:-1, :, :-1], y[1:, :, :-1], x[:, :-1, :-1]):
-        flat &= edges
-    return flat
 
 
 def turning(volume: Volume, low: float, high: float, blur: float = 0.0) -> float:
@@ -223,7 +150,7 @@ def topology(solid: NDArray[np.bool_]) -> tuple[int, int, int]:
 
     def without_crumbs(these: NDArray[np.bool_], connected: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], int]:
         piece, _ = label(these, connected)
-        keep = np.bincount(piece.reshape(-1)) >= _PLATEAU
+        keep = np.bincount(piece.reshape(-1)) >= FEWEST
         keep[0] = False
         return keep[piece], int(keep.sum())
 
