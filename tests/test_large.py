@@ -1,5 +1,7 @@
 """Large fields are looked at in slabs, cubes and columns: here small ones are, and nothing or little changes."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 
@@ -89,3 +91,16 @@ def test_points_in_some_columns_are_even_over_the_range(monkeypatch):
     np.testing.assert_allclose(counts / counts.mean(), 1, atol=0.1)
     away = np.linalg.norm(asked.point, axis=1)  # level c is the sphere of radius 1.2 - c
     np.testing.assert_allclose(1.2 - away, asked.level[:, 0], atol=0.01)
+
+
+def test_pieces_of_plateaus_are_forgotten_when_they_end(monkeypatch):
+    monkeypatch.setattr(slabs, "__defaults__", (60 * 60 * 6,))
+    values = ((np.indices((60, 60, 60)) // 3).sum(axis=0) % 7).astype(np.uint8)  # a piece in every 27 voxels
+    peaks = []
+    for volume in (Volume(values), Volume(np.concatenate([values] * 5))):
+        plateaus(volume)  # compiles
+        tracemalloc.start()
+        assert plateaus(volume) == []
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert peaks[1] < 1.3 * peaks[0]

@@ -1,5 +1,7 @@
 """Zarr, OME-Zarr and HDF5, read some chunks at a time; arrays larger than a quarter of the memory are paged."""
 
+import importlib
+
 import h5py
 import numpy as np
 import pytest
@@ -193,3 +195,23 @@ def test_a_paged_field_has_the_light_of_one_in_memory(tmp_path, monkeypatch):
     assert np.array_equal(*(one.grids[0].light for one in light))
     light[1].save(tmp_path / "out", preview=False)
     assert np.array_equal(ig.load(tmp_path / "out").scene.fields[0].volume.values, values)
+
+
+@NOTED
+def test_of_several_resolutions_the_finest_that_is_not_too_large_is_read(tmp_path, recwarn):
+    ome(tmp_path / "cell.ome.zarr", RANDOM)
+    sizes = {most: read_volume(tmp_path / "cell.ome.zarr", channel=0, most=most).shape for most in (None, 2000, 200, 1)}
+    assert sizes == {None: (11, 9, 13), 2000: (11, 9, 13), 200: (6, 5, 6), 1: (6, 5, 6)}
+    said = [str(one.message) for one in recwarn]
+    assert all("0, the finest, was read" in one for one in said[:2])
+    assert all("1, in whose means noise, plateaus and thin parts of 0 are lost, was read" in one for one in said[2:])
+    assert read_volume(tmp_path / "cell.ome.zarr", channel=0, array=0, most=1).shape == (11, 9, 13)
+
+
+def test_info_describes_a_large_image_from_its_coarser_resolution_and_says_so(call, tmp_path, monkeypatch):
+    monkeypatch.setattr(importlib.import_module("illumgrid.cli.info"), "MOST", 200)  # `cli.info` is its command
+    ome(tmp_path / "cell.ome.zarr", RANDOM)
+    for options, shape in (([], "6 x 5 x 6"), (["--array", 0], "11 x 9 x 13"), (["--crop", *"084809"], "8 x 4 x 9")):
+        said = call("info", tmp_path / "cell.ome.zarr", "--channel", 0, *options)
+        assert f"{shape} voxels" in said
+        assert ("1, in whose means noise" in said) == (options == [])

@@ -17,6 +17,9 @@ BLOCKS = " ▁▂▃▄▅▆▇█"
 PLAIN = " .:-=+*#@"
 """Where the terminal or the pipe has no block characters."""
 
+MOST = 1 << 27
+"""Voxels: a larger image is described from a coarser resolution of it, if the file has one and none is chosen."""
+
 
 def histogram_line(counts: "Sequence[int]") -> str:
     """Histogram in a line of block characters; heights are logarithmic."""
@@ -80,7 +83,8 @@ def _describe_volume(source: str, limits: tuple[float, float] | None, inside: "S
     labels = labels_of(reading.pop("label", None))
     if len(labels) > 1:
         raise BadInput(f"--label holds {len(labels)} labels; expected one for info; ask for one after another")
-    volume = finite(read_volume(source, **reading, label=labels[0] if labels else None), inside)
+    enough = None if labels or {"crop", "downsample"} & set(reading) else MOST
+    volume = finite(read_volume(source, **reading, label=labels[0] if labels else None, most=enough), inside)
     needs.check("info", needs.of_field(volume.stored.size, needs.TO_DESCRIBE), "cut or --downsample the volume")
     _describe_lattice(volume_name(source), volume, histogram(volume, store.BINS)[0].tolist(), volume.extremes)
     low, high, why = suggest_range(volume, inside)

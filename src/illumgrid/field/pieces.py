@@ -49,7 +49,7 @@ def number_cells(flat, plane, parent, size, first, before, count):
     Returns
     -------
     count : int
-        How many numbers there are now; `parent` is then the final number of each, which is its own for those that count.
+        How many numbers there are now. `parent` then leads to the first of a piece at once, whose records are true.
     """
     nx, ny, nz = flat.shape
     for number in range(count):

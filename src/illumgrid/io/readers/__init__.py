@@ -73,6 +73,7 @@ def read_volume(
     crop: Sequence[int] | None = None,
     downsample: int | None = None,
     follow: bool = False,
+    most: int | None = None,
 ) -> Volume:
     """Read a scalar field from a file, or from a folder of slices.
 
@@ -94,6 +95,9 @@ def read_volume(
         Take means over blocks of so many voxels along each axis.
     follow : bool
         Read data files outside the folder of the header that names them.
+    most : int, optional
+        Voxels: of an image in several resolutions read the finest that has no more, or else the coarsest. By default
+        the finest of all is read.
 
     Returns
     -------
@@ -115,7 +119,7 @@ def read_volume(
     if not os.fspath(path):
         raise BadInput(f"the name of the volume is empty; {EXPECTED}")  # and not the folder one is in
     file = Path(os.path.abspath(path))
-    wanted = Wanted(channel, time, array, crop, None if label is not None else downsample, follow)
+    wanted = Wanted(channel, time, array, crop, None if label is not None else downsample, follow, most)
     with named(file, EXPECTED) as shown:
         stored = _read(file, wanted)
         if spacing is not None:

@@ -32,6 +32,8 @@ class Wanted:
     downsample: int | None = None
     follow: bool = False
     """Read data files outside the folder of the header that names them."""
+    most: int | None = None
+    """Of an image in several resolutions, which none is chosen of, the finest of at most so many voxels is read."""
 
     def spans(self, shape: Sequence[int]) -> list[Span]:
         """What is kept of the axes x, y and z of a volume; refused where that cannot be."""

@@ -5,6 +5,7 @@ References
 .. [1] https://ngff.openmicroscopy.org/0.5/
 """
 
+import math
 import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
@@ -29,7 +30,7 @@ _DEEP = 3
 
 
 def read_folder(folder: Path, wanted: Wanted) -> Stored:
-    """Read one array of a folder: of an image in several resolutions the finest, or that of `--array`."""
+    """Read one array of a folder: of an image in several resolutions one, by default the finest."""
     import zarr
 
     with warnings.catch_warnings():
@@ -75,15 +76,18 @@ def _within(group: Any, before: str, deep: int) -> Iterator[tuple[str, Any]]:
 def _read_image(group: Any, wanted: Wanted) -> Stored:
     about: Any = _image(group)
     levels = [str(level["path"]) for level in about["datasets"]]
-    number = 0 if wanted.array is None else pick(wanted.array, "array", levels)
-    array = group[levels[number]]
     axes = [axis if isinstance(axis, dict) else {"name": axis} for axis in about.get("axes") or "tczyx"]
     names = [str(axis.get("name")) for axis in axes]
-    if len(names) != len(array.shape):
-        raise BadInput(f"its axes are {', '.join(names)}, its array has {len(array.shape)}; mend its metadata")
     order = axes_of(names)
     if order is None:
         raise BadInput(f"its axes are {', '.join(names)}; expected x, y and z among them")
+    for level in levels:
+        if len(names) != len(group[level].shape):
+            raise BadInput(
+                f"its axes are {', '.join(names)}, its array has {len(group[level].shape)}; mend its metadata"
+            )
+    number = _level(group, levels, order, wanted)
+    array = group[levels[number]]
     steps, origin = np.ones(len(names)), np.zeros(len(names))
     for change in (about["datasets"][number], about):
         steps, origin = _transformed(steps, origin, change.get("coordinateTransformations") or ())
@@ -92,12 +96,25 @@ def _read_image(group: Any, wanted: Wanted) -> Stored:
     notes: tuple[Note, ...] = ()
     if len(levels) > 1 and wanted.array is None:
         sizes = [f"{k} {'x'.join(str(group[path].shape[axis]) for axis in order)}" for k, path in enumerate(levels[:8])]
-        notes = (("choice", f"holds one image in {len(levels)} resolutions ({', '.join(sizes)}): 0, the finest, was "
+        which = (
+            f"{number}, in whose means noise, plateaus and thin parts of 0 are lost," if number else "0, the finest,"
+        )
+        notes = (("choice", f"holds one image in {len(levels)} resolutions ({', '.join(sizes)}): {which} was "
                   "read; --array N (array=N) reads another"),)  # fmt: skip
     elif not _spaced(about, number):
         notes = (("spacing", "its metadata do not say the distance between voxels: 1 is taken; give --spacing"),)
     chosen = by_name(names, array.shape, wanted)
     return _box(array, order, chosen, wanted, steps[order], origin[order], unit, notes)
+
+
+def _level(group: Any, levels: list[str], order: list[int], wanted: Wanted) -> int:
+    """Which resolution is read."""
+    if wanted.array is not None:
+        return pick(wanted.array, "array", levels)
+    if wanted.most is None:
+        return 0
+    sizes = [math.prod(group[level].shape[axis] for axis in order) for level in levels]
+    return next((k for k, size in enumerate(sizes) if size <= wanted.most), len(levels) - 1)
 
 
 def _spaced(about: Mapping[str, Any], number: int) -> bool:
