@@ -19,6 +19,7 @@ from illumgrid.cli.info import info
 from illumgrid.cli.plugins import plugins
 from illumgrid.cli.preview import preview
 from illumgrid.cli.run import run
+from illumgrid.cli.stops import listen, sentence
 from illumgrid.cli.terminal import say, say_what_compiles
 from illumgrid.cli.verify import verify
 from illumgrid.cli.view import view
@@ -62,8 +63,7 @@ def root(
 def main() -> None:
     """Run the command line: exit 2 and one sentence on bad input, 130 on Ctrl-C, SIGTERM and SIGHUP."""
     stops = [number for number in disk.STOPS if signal.getsignal(number) != signal.SIG_IGN]  # nohup ignores one
-    for number in stops:
-        signal.signal(number, signal.default_int_handler)
+    listen(stops)
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # what the terminal or the pipe has no sign for is written as \\u00fc
             stream.reconfigure(errors="backslashreplace")
@@ -97,9 +97,7 @@ def guarded(command: Callable[[], Any]) -> int:
             raise KeyboardInterrupt
         return code if isinstance(code, int) else 0
     except (typer.Abort, KeyboardInterrupt):
-        done = [f"{place} is written and complete" for place in disk.written if not place.name.endswith(".partial")]
-        what = next(iter([*disk.kept, *done]), "nothing was written")
-        say(f"illumgrid: stopped; {what}")
+        say(sentence())
         return 130
     except BadInput as error:
         say(f"illumgrid: {in_options(str(error))}")

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from illumgrid.cli.terminal import omitted_light, say
 from illumgrid.errors import tell
+from illumgrid.io import disk
 
 if TYPE_CHECKING:
     from illumgrid.io.elsewhere import Source
@@ -26,11 +27,14 @@ def save(light: "Illumination", folder: Path, preview: bool, overwrite: bool, so
         for place in (gettempdir(), "~"):
             with suppress(Exception):
                 work = Path(mkdtemp(prefix="illumgrid-", dir=Path(place).expanduser()))
+                disk.begun.append(work)
                 try:
                     light.save(work / folder.name, preview=False, source=source)
                 except BaseException:
                     rmtree(work, ignore_errors=True)
                     raise
+                finally:
+                    disk.begun.remove(work)
                 say(f"the light is kept in {work / folder.name}; move that folder to where you want it")
                 break
         raise

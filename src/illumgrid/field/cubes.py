@@ -1,4 +1,4 @@
-"""Marching cubes of scikit-image a few planes at a time: Ctrl-C waits for one slab, not for millions of triangles."""
+"""Marching cubes of scikit-image a few cells at a time: Ctrl-C waits for one piece, not for millions of triangles."""
 
 from typing import Literal
 
@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from illumgrid.field.volume import Floats
 
 AT_ONCE = 1 << 19
-"""Cells of a slab: at most half a second, where every cell is crossed."""
+"""Cells of a call, at most half more: 0.4 to 0.8 s on one machine where every cell is crossed."""
 
 Winding = Literal["ascent", "descent"]
 
@@ -16,25 +16,39 @@ Winding = Literal["ascent", "descent"]
 def march(values: NDArray[np.float32], level: float, winding: Winding) -> tuple[Floats, NDArray[np.int64]]:
     """Vertices (k, 3), in indices, and faces (m, 3) of the level set of an array, as one call would number them.
 
-    Along the first axis vertices have more digits than one call gives them, whose single precision holds the index and
-    the share of the edge together.
+    The array is cut into slabs along the first axis, and each plane of cells into strips along the second where two
+    planes are too many. Along these axes vertices have more digits than one call gives them, whose single precision
+    holds the index and the share of the edge together.
     """
-    rows = max(1, AT_ONCE // ((values.shape[1] - 1) * (values.shape[2] - 1)))
-    vertices, faces = [np.zeros((0, 3))], [np.zeros((0, 3), np.int64)]
-    count = 0
+    rows, wide, deep = (n - 1 for n in values.shape)
+    cut = 2 * wide * deep > AT_ONCE
+    rows, wide = (1, max(1, AT_ONCE // (2 * deep) - 1)) if cut else (max(1, AT_ONCE // (wide * deep)), wide)
+    vertices, faces, count = [np.zeros((0, 3))], [np.zeros((0, 3), np.int64)], 0
+    starts, begins = (
+        list[int](),
+        list[int](),
+    )  # of the slab before and this one: where the faces begin that a strip meets
     for first in range(0, values.shape[0] - 1, rows):
-        # Each slab begins with the last layer of cells of the slab before: their faces come in the same order, and so
-        # say which vertex is which. Places would not: vertices of several edges may meet in a corner.
-        shared = _cubes(values[first - 1 : first + 1], level, winding) if first else None
-        old, again = (len(part) for part in shared) if shared else (0, 0)
-        begin = max(first - 1, 0)
-        points, triangles = _cubes(values[begin : first + rows + 1], level, winding)
-        number = np.arange(count - old, count - old + len(points))
-        number[triangles[:again]] = faces[-1][len(faces[-1]) - again :]
-        points[:, 0] += begin
-        vertices.append(points[old:])
-        faces.append(number[triangles[again:]])
-        count += len(points) - old
+        met, starts, begins, done = np.concatenate(faces[-max(1, len(begins)) :]), begins, [], 0
+        for low in range(0, values.shape[1] - 1, wide):
+            # A piece begins with the last layer of cells of the slab before and the last row of the strip before: their
+            # faces come in the same order, and so say which vertex is which. Places would not: vertices of several
+            # edges may meet in a corner.
+            x, y = max(first - 1, 0), max(low - 1, 0)
+            part = values[x : first + rows + 1, y : low + wide + 1]
+            above = len(_cubes(part[:2], level, winding)[1]) if first else 0
+            aside = len(_cubes(part[-2:, :2], level, winding)[1]) if low else 0
+            start = starts[len(begins)] if cut and first else len(met) - above
+            known = np.concatenate([met[start : start + above], faces[-1][len(faces[-1]) - aside :]])
+            begins.append(done - aside)
+            points, triangles = _cubes(part, level, winding)
+            old = int(triangles[: len(known)].max(initial=-1)) + 1
+            number = np.arange(count - old, count - old + len(points))
+            number[triangles[: len(known)]] = known
+            points[:, :2] += x, y
+            vertices.append(points[old:])
+            faces.append(number[triangles[len(known) :]])
+            count, done = count + len(points) - old, done + len(faces[-1])
     return np.concatenate(vertices), np.concatenate(faces)
 
 

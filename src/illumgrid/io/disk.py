@@ -24,6 +24,8 @@ STOPS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") 
 
 written: list[Path] = []
 """What this process has put in place, in order: the truth to tell when it is stopped."""
+begun: list[Path] = []
+"""Hidden folders that are being written; a process that is ended from outside its work removes them."""
 kept: list[str] = []
 """What a stopped process has kept of its work, as a sentence; empty where there is nothing."""
 
@@ -105,23 +107,30 @@ def make_parents(place: Path) -> None:
 def beside(place: Path) -> Iterator[Path]:
     """Give an empty hidden folder beside `place`, which is gone afterwards; those of dead processes go first."""
     sweep(place)
-    work, handle = _hidden(place)
+    with temporary(f".{place.name[:50]}-", place.parent) as work:  # cut, or the name would get too long
+        yield work
+
+
+@contextmanager
+def temporary(prefix: str, above: Path) -> Iterator[Path]:
+    """Give a new folder that is locked, and gone afterwards."""
+    work, handle = None, None
     try:
+        with held():  # a stop comes before it is made, or when it is known
+            while work is None:
+                work = Path(tempfile.mkdtemp(prefix=prefix, dir=above))
+                try:
+                    handle = lock(work)
+                except FileNotFoundError:  # swept before it was locked
+                    work = None
+            begun.append(work)
         yield work
     finally:
-        shutil.rmtree(work, ignore_errors=True)
+        if work is not None:
+            shutil.rmtree(work, ignore_errors=True)
+            begun.remove(work)
         if handle is not None:
             os.close(handle)
-
-
-def _hidden(place: Path) -> tuple[Path, int | None]:
-    """Make a hidden folder and lock it."""
-    while True:
-        work = Path(tempfile.mkdtemp(prefix=f".{place.name[:50]}-", dir=place.parent))  # cut, or it would get too long
-        try:
-            return work, lock(work)
-        except FileNotFoundError:  # swept before it was locked
-            continue
 
 
 def lock(folder: Path) -> int | None:

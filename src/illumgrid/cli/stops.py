@@ -1,0 +1,78 @@
+"""Ctrl-C, SIGTERM and SIGHUP end a command at once, also inside a library that does not look for signals.
+
+Python raises KeyboardInterrupt when the main thread is back in Python. A filter or a search tree of a large array is
+one call that takes many seconds; a thread ends the process then, and removes what it has begun to write.
+"""
+
+import os
+import select
+import shutil
+import signal
+import sys
+import threading
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+from types import FrameType
+
+from illumgrid.io import disk
+
+PATIENCE = 0.4
+"""Seconds that the main thread has to answer a signal."""
+
+
+def listen(numbers: Sequence[int]) -> None:
+    """Raise KeyboardInterrupt on these signals, or else end the process."""
+    came, tell = os.pipe()
+    seen, ending = [0], threading.RLock()
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        seen[0] += 1
+        with suppress(OSError):
+            os.read(came, 4096)
+        with ending:  # which a thread that ends the process keeps
+            raise KeyboardInterrupt
+
+    def watch() -> None:
+        while True:
+            select.select([came], [], [])
+            before = seen[0]
+            time.sleep(PATIENCE)
+            if any(signal.getsignal(number) is not stop for number in numbers):  # between two renames, or at the end
+                continue
+            with ending, suppress(BlockingIOError):
+                if seen[0] == before and set(os.read(came, 4096)) & set(numbers):
+                    _end()
+
+    def lost(unraisable: "sys.UnraisableHookArgs") -> None:
+        if issubclass(unraisable.exc_type, KeyboardInterrupt):  # in a callback of a library, such as LLVM's
+            again = threading.Timer(PATIENCE / 4, signal.raise_signal, [numbers[0]])
+            again.daemon = True
+            again.start()
+        else:
+            sys.__unraisablehook__(unraisable)
+
+    sys.unraisablehook = lost
+    for number in numbers:
+        signal.signal(number, stop)
+    if os.name == "nt" or not numbers:  # Windows waits for no pipe
+        return
+    for end in (came, tell):
+        os.set_blocking(end, False)
+    signal.set_wakeup_fd(tell, warn_on_full_buffer=False)
+    threading.Thread(target=watch, daemon=True).start()
+
+
+def _end() -> None:
+    for place in list(disk.begun):
+        shutil.rmtree(place, ignore_errors=True)
+    with suppress(OSError, ValueError):
+        clear = "\r\x1b[2K\x1b[?25h" if sys.stderr.isatty() else ""  # a bar of progress, which hides the cursor
+        os.write(sys.stderr.fileno(), f"{clear}{sentence()}\n".encode(errors="backslashreplace"))
+    os._exit(130)
+
+
+def sentence() -> str:
+    """What a stopped command leaves."""
+    done = [f"{place} is written and complete" for place in disk.written if not place.name.endswith(".partial")]
+    return f"illumgrid: stopped; {next(iter([*disk.kept, *done]), 'nothing was written')}"
