@@ -22,7 +22,7 @@ def test_what_was_found_once_is_refused(kept, tmp_path):
 @forks
 @pytest.mark.parametrize("target", fuzz.TARGETS, ids=lambda target: target.name)
 def test_a_moment_of_fuzzing(target):
-    assert list(fuzz.batch(target, 1_000_000, 40)) == []
+    assert list(fuzz.batch(target, 1_000_000, target.moment)) == []
 
 
 @forks

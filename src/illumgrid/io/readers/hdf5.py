@@ -1,31 +1,34 @@
 """Datasets of HDF5, which NetCDF 4 is as well: read some chunks at a time. An image that ITK wrote goes to ITK."""
 
-from typing import Any
+from importlib.util import find_spec
 
-import h5py
 import numpy as np
 
 from illumgrid.errors import BadInput
+from illumgrid.io.readers.apart import Apart, Part, apart
 from illumgrid.io.readers.arrays import three_axes
 from illumgrid.io.readers.chunked import axes_of, by_name, read_box
 from illumgrid.io.readers.limits import check_axes
 from illumgrid.io.readers.source import Source, seekable
 from illumgrid.io.readers.stored import Note, Stored, Wanted, pick
 
-_MOST = 10_000
-"""Datasets that are looked at."""
+if find_spec("h5py") is None:
+    raise ModuleNotFoundError("No module named 'h5py'", name="h5py")
 
 
 def read(source: Source, wanted: Wanted) -> Stored:
     """Read the only dataset of three or more axes, or that of `--array`."""
-    with seekable(source) as stream, h5py.File(stream if source.packed else source.file, "r") as file:
-        if "ITKImage" in file:
+    packed = b""
+    if source.packed:
+        with seekable(source) as stream:
+            packed = stream.read()
+    with apart("hdf5", source.file, packed) as file:
+        found = file.ask()
+        if found["itk"]:
             return _by_itk(source, wanted)
-        found = _datasets(file)
-        if not found:
+        if not found["names"]:
             raise BadInput("holds no dataset of numbers with three axes; expected one")
-        names = [name for name, _ in found]
-        return _read(found[pick(wanted.array, "array", names)][1], wanted)
+        return _read(file, found["names"][pick(wanted.array, "array", found["names"])], wanted)
 
 
 def _by_itk(source: Source, wanted: Wanted) -> Stored:
@@ -41,23 +44,11 @@ def _by_itk(source: Source, wanted: Wanted) -> Stored:
     return itk.read(source, wanted)
 
 
-def _datasets(file: Any) -> list[tuple[str, Any]]:
-    """Datasets of three or more axes by name; links to other files are not followed."""
-    found: list[tuple[str, Any]] = []
-
-    def look(name: str, node: Any) -> bool | None:
-        if isinstance(node, h5py.Dataset) and len(node.shape or ()) >= 3 and node.dtype.kind in "biuf":
-            found.append((name, node))
-        return True if len(found) >= _MOST else None
-
-    file.visititems(look)
-    return sorted(found, key=lambda pair: pair[0])
-
-
-def _read(data: Any, wanted: Wanted) -> Stored:
-    if data.is_virtual or data.external:
+def _read(file: Apart, name: str, wanted: Wanted) -> Stored:
+    about = file.ask(name=name)
+    if about["elsewhere"]:
         raise BadInput("its numbers lie in other files; expected them in this one; copy it with h5repack")
-    names = [dim.label.lower() for dim in data.dims]
+    data, names = Part(file, name, about["shape"], about["dtype"], about["chunks"]), about["names"]
     order, chosen = axes_of(names), {}
     if order is not None:
         chosen = by_name(names, data.shape, wanted)
@@ -66,13 +57,13 @@ def _read(data: Any, wanted: Wanted) -> Stored:
         chosen = {axis: span.first for axis, span in enumerate(spans) if axis not in order}
     space = tuple(int(data.shape[axis]) for axis in order)
     check_axes(space)
-    sizes, unit = np.ravel(data.attrs.get("element_size_um", ())), None  # of ilastik and Fiji, in the order of the axes
+    sizes, unit = np.array(about["sizes"]), None
     steps, notes = np.ones(3), tuple[Note, ...]()
-    if sizes.dtype.kind in "iuf" and len(sizes) == len(data.shape):
-        steps, unit = sizes[order].astype(float), "µm"
-    elif sizes.dtype.kind in "iuf" and len(sizes) == 3:
-        steps, unit = sizes[np.argsort(np.argsort(order))].astype(float), "µm"
+    if len(sizes) == len(data.shape):
+        steps, unit = sizes[order], "µm"
+    elif len(sizes) == 3:
+        steps, unit = sizes[np.argsort(np.argsort(order))], "µm"
     else:
         notes = (("spacing", "it does not say the distance between voxels: 1 is taken; give --spacing"),)
-    values = read_box(data, data.chunks or (1,) * len(data.shape), order, chosen, wanted.spans(space))
+    values = read_box(data, data.chunks, order, chosen, wanted.spans(space))
     return Stored(values, np.zeros(3), np.diag(steps), unit=unit, notes=notes, whole=space)
