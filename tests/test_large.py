@@ -5,6 +5,7 @@ import tracemalloc
 import numpy as np
 import pytest
 
+import illumgrid as ig
 from illumgrid.accuracy.points import unseen_in_volume
 from illumgrid.field import boundaries, bricks, diagnosis
 from illumgrid.field.boundaries import suggest_range
@@ -16,9 +17,11 @@ from illumgrid.field.plateaus import plateaus
 from illumgrid.field.scene import Field
 from illumgrid.field.volume import Volume, histogram, interpolate, slabs, world_to_index
 from illumgrid.grid.nodes import reachable
-from illumgrid.samplers import coarea
+from illumgrid.interpolators import nearest
+from illumgrid.samplers import coarea, direct
 from illumgrid.show.camera import outline_of
 from illumgrid.show.viewer.arrays import field_steps
+from illumgrid.transport import walk
 from shapes import ball, sky
 
 
@@ -104,3 +107,19 @@ def test_pieces_of_plateaus_are_forgotten_when_they_end(monkeypatch):
         peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
     assert peaks[1] < 1.3 * peaks[0]
+
+
+def test_a_further_lit_node_takes_60_bytes(monkeypatch):
+    for module, name, value in ((walk, "MOST", 2000), (walk, "LOOKED_AT", 4000), (nearest, "_SLAB", 2000)):
+        monkeypatch.setattr(module, name, value)
+    monkeypatch.setattr(direct, "_BATCH", 1000)
+    scene = ig.Scene.sky(ball(20), range=(-1.0, 1.3), albedo=(0.8, 0.5, 0.3))  # every node is lit, in three channels
+    peaks, nodes = [], []
+    for grid in (8, 30, 50):  # the first compiles
+        tracemalloc.start()
+        light = ig.run(scene, grid=grid, paths=1, bounces=0, judge=False)
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+        nodes.append(light.recipe["queries"])
+    assert nodes[1:] == [30**3, 50**3] and len(light.grids[0].channels) == 3
+    assert (peaks[2] - peaks[1]) / (nodes[2] - nodes[1]) <= 60

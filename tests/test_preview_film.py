@@ -2,6 +2,7 @@
 
 import importlib.util
 import io
+import weakref
 
 import numpy as np
 import pytest
@@ -15,6 +16,12 @@ from shapes import lit, refused, sky
 from test_tone_preview import three_balls
 
 RUN = ["run", "v.npy", "--range", 0.3, 0.9, "--grid", 6, "--paths", 2, "--no-preview", "-o", "out"]
+
+
+class Frame(np.ndarray):
+    """A picture whose life is followed."""
+
+    __hash__ = object.__hash__
 
 
 @pytest.fixture
@@ -113,9 +120,40 @@ def test_a_long_film_is_four_seconds_and_a_colour_survives_the_palette_of_a_gif(
     smooth = np.linspace(0, 1, 64)[:, None, None] * np.linspace(50, 250, 48)[None, :, None]
     pictures = [np.clip(smooth * [1, 0.6, 0.3] + 3 * random.normal(size=(64, 48, 3)), 0, 255).astype(np.uint8)
                 for _ in range(50)]  # fmt: skip
-    with Image.open(io.BytesIO(film(pictures, ".gif"))) as image:
-        assert image.info["duration"] == 80
+    film(pictures, 50, ".gif", out := io.BytesIO())
+    with Image.open(out) as image:
+        assert image.info["duration"] == 80 and image.n_frames == 50
         assert np.abs(np.asarray(image.convert("RGB")).astype(int) - pictures[0]).mean() < 5
+
+
+@pytest.mark.parametrize("ending", [".gif", ".webp", ".mp4"])
+def test_frames_are_let_go_when_they_are_encoded(ending):
+    if ending == ".mp4":
+        pytest.importorskip("imageio_ffmpeg")
+    alive: weakref.WeakSet[Frame] = weakref.WeakSet()
+    most = 0
+
+    def drawn():
+        nonlocal most
+        for k in range(20):
+            picture = np.full((40, 60, 3), 255, np.uint8).view(Frame)
+            picture[5:20, 2 * k : 2 * k + 15] = (250, 120, 10)
+            picture[30:, : 3 * (k // 2)] = (10, 20, 200)
+            alive.add(picture)
+            yield picture
+            del picture
+            most = max(most, len(alive))
+
+    film(drawn(), 20, ending, out := io.BytesIO())
+    assert most <= 2
+    if ending != ".mp4":
+        with Image.open(out) as image:
+            assert image.n_frames == 20
+            for k in range(20):
+                image.seek(k)
+                seen = np.asarray(image.convert("RGB")).astype(int)
+                assert np.abs(seen[8:17, 2 * k + 3 : 2 * k + 12] - (250, 120, 10)).mean() < 12
+                assert np.abs(seen[22:28] - 255).mean() < 12
 
 
 def test_what_does_not_go_together_is_refused(call, refuse, tmp_path):

@@ -3,7 +3,7 @@
 import difflib
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -151,14 +151,28 @@ class Illumination:
     @cached_property
     def exposure(self) -> float:
         """Automatic exposure: one for all isovalues, views and fields, from the light that the grids hold."""
-        mean, brightest = [], []
-        for f, grid in zip(self.scene.fields, self.grids):
-            for block in grid.blocks():
-                lit = block.values[block.support > 0]
-                mean.append(lit.mean(axis=1))
-                brightest.append((lit * f.material.albedo).max(axis=1))
+        count = sum(int((block.support > 0).sum()) for grid in self.grids for block in grid.blocks())
+        if not count:
+            return 1.0
         highlights = tone.DIRECTED if any(isinstance(one, Distant) for one in self.scene.lights) else tone.EVEN
-        return tone.exposure_under(np.concatenate(mean), np.concatenate(brightest), highlights)
+        # One after the other and in place: both together, with copies, would be as much as the light itself.
+        mean = self._of_lit(lambda lit, albedo: lit.mean(axis=1), np.empty(count, np.float32))
+        median = float(np.median(mean, overwrite_input=True))
+        del mean
+        brightest = self._of_lit(lambda lit, albedo: (lit * albedo).max(axis=1), np.empty(count))
+        return tone.exposure_under(
+            median, float(np.quantile(brightest, highlights[0], overwrite_input=True)), highlights
+        )
+
+    def _of_lit(self, worth: Callable[[Any, Any], Any], out: NDArray[Any]) -> NDArray[Any]:
+        """A number for each node that has light of its own, from the light (n, 3) of some and their albedo."""
+        first = 0
+        for field_, grid in zip(self.scene.fields, self.grids):
+            for block in grid.blocks():
+                found = worth(block.values[block.support > 0], field_.material.albedo)
+                out[first : first + len(found)] = found
+                first += len(found)
+        return out
 
     @cached_property
     def marchable(self) -> Marchable:

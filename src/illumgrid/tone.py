@@ -23,18 +23,15 @@ def automatic_exposure(
     Under the median light a colour given as albedo comes out as that colour, unless that share of the brightest channel
     would then exceed the radiance of `highlights`. 1 if all is dark.
     """
-    return exposure_under(irradiance.mean(axis=1), (irradiance * albedo).max(axis=1), highlights)
-
-
-def exposure_under(
-    mean: NDArray[np.floating], brightest: NDArray[np.floating], highlights: tuple[float, float] = EVEN
-) -> float:
-    """As `automatic_exposure`, from the mean irradiance (n,) and the brightest channel (n,) of albedo · irradiance."""
-    share, most = highlights
-    if not len(mean):
+    if not len(irradiance):
         return 1.0
-    median = float(np.median(mean)) / np.pi
-    bright = float(np.quantile(brightest, share)) / np.pi
+    median = np.median(irradiance.mean(axis=1))
+    return exposure_under(median, np.quantile((irradiance * albedo).max(axis=1), highlights[0]), highlights)
+
+
+def exposure_under(median: float, bright: float, highlights: tuple[float, float] = EVEN) -> float:
+    """As `automatic_exposure`, from the median irradiance and the share of the brightest channels of albedo · it."""
+    median, bright, most = float(median) / np.pi, float(bright) / np.pi, highlights[1]
     factors = [target / value for target, value in ((1.0, median), (most, bright)) if 0 < value < np.inf]
     return min(factors, default=1.0)
 

@@ -347,7 +347,8 @@ def _film(
                 yield picture
 
         if path.suffix:
-            disk.write_file(path, film(list(reported()), path.suffix.lower()))
+            with disk.fresh_file(path) as fresh, fresh.open("wb") as file:
+                film(reported(), count, path.suffix.lower(), file)
         else:
             about = _about(camera)
             pictures = ((f"{number:04}.png", png(picture, about)) for number, picture in enumerate(reported()))

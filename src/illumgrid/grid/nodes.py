@@ -45,7 +45,12 @@ def _any_overlapped(cells: NDArray[np.bool_], parts: list[slice], axis: int) -> 
 
 
 def reachable(field: Field, spec: GridSpec) -> NDArray[np.int64]:
-    """Flat numbers of the nodes that a lookup on some isosurface of the field's range can read.
+    """Flat numbers of the nodes that a lookup on some isosurface of the field's range can read: see `reached`."""
+    return np.flatnonzero(reached(field, spec))
+
+
+def reached(field: Field, spec: GridSpec) -> NDArray[np.bool_]:
+    """Which nodes (nx, ny, nz) a lookup on some isosurface of the field's range can read.
 
     These are the corners of all grid cells that overlap a voxel cell crossed by a level set of the range.
     """
@@ -57,7 +62,7 @@ def reachable(field: Field, spec: GridSpec) -> NDArray[np.int64]:
     nodes = np.zeros(spec.shape, bool)
     for corner in np.ndindex(2, 2, 2):
         nodes[tuple(slice(c, c + n) for c, n in zip(corner, crossed.shape))] |= crossed
-    return np.flatnonzero(nodes)
+    return nodes
 
 
 @dataclass(frozen=True, eq=False)

@@ -27,7 +27,7 @@ class Nearest:
         """Fill every node: see `illumgrid.stages.Interpolator`."""
         from scipy.spatial import KDTree
 
-        spec, good = nodes.spec, np.flatnonzero(samples.paths > 0)
+        spec = nodes.spec
         light = np.zeros((len(nodes), samples.light.shape[1]), np.float32)
         error = np.full(len(nodes), np.inf, np.float32)
         support = np.zeros(len(nodes), np.float32)
@@ -36,16 +36,17 @@ class Nearest:
 
         def take(node: NDArray[np.integer], sample: NDArray[np.integer]) -> None:
             for first in range(0, len(node), _SLAB):
-                some, rows = node[first : first + _SLAB], good[sample[first : first + _SLAB]]
+                some, rows = node[first : first + _SLAB], sample[first : first + _SLAB]
                 light_of, spread = samples.light[rows], samples.spread[rows]
                 own = Samples(nowhere, light_of, spread, samples.paths[rows], samples.channels)
                 light[some], error[some], support[some] = own.light, own.error, 1.0
                 if errors is not None and own.errors is not None:
                     errors[some] = own.errors
 
-        def points() -> Iterator[tuple[int, Floats]]:
-            for first in range(0, len(good), _SLAB):
-                yield first, samples.queries[good[first : first + _SLAB]].point
+        def points() -> Iterator[tuple[NDArray[np.int64], Floats]]:
+            for first in range(0, len(samples), _SLAB):  # numbers of all at once would take a fifth of what they hold
+                good = first + np.flatnonzero(samples.paths[first : first + _SLAB] > 0)
+                yield good, samples.queries[good].point
 
         many = np.zeros(len(nodes), np.uint8)  # samples on each node: 0, 1, or 2 for more
 
@@ -55,21 +56,22 @@ class Nearest:
                 many[node] = np.minimum(many[node] + count, 2)
                 yield some
 
-        if len(good):
+        if (samples.paths > 0).any():
             reach = diagonal(spec)
             candidates = near_samples(spec, counted(), reach).reshape(-1)
-            for first, some in points():
+            for good, some in points():
                 node, sample = on_nodes(spec, some)
                 alone = many[node] == 1
-                take(node[alone], first + sample[alone])
+                take(node[alone], good[sample[alone]])
             candidates[many == 1] = False
             if candidates.any():
                 # Coordinates relative to the grid's origin: differences of large world coordinates would lose digits.
                 tree = KDTree(np.concatenate([some - spec.origin for _, some in points()]))
+                number = np.flatnonzero(samples.paths > 0)
                 for block in nodes.blocks(np.flatnonzero(candidates), _SLAB):
                     distance, sample = tree.query(block.point - spec.origin, distance_upper_bound=reach)
                     near = np.isfinite(distance)
-                    take(block.flat[near], sample[near])
+                    take(block.flat[near], number[sample[near]])
                 del tree
         return nodes.grid(light, error, support, samples.channels, errors)
 

@@ -20,6 +20,7 @@ from importlib.metadata import version
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal
+from zipfile import ZIP_DEFLATED, ZipFile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,6 +39,8 @@ Record = dict[str, Any]
 FORMAT = 2  # 1 had nodes that the projection moves in another order
 EVERY = 10.0
 """Seconds from one writing to the next, and before the first: a shorter run leaves nothing."""
+HELD = 1 << 20
+"""Rows that are held until then, at most."""
 CHUNK = 4096
 """Rows of a chunk."""
 MOMENT_ARRAYS = ("light", "spread", "paths")
@@ -241,7 +244,7 @@ class Partial:
     def keep(self, rows: NDArray[np.int64], answer: Answer) -> None:
         """See `Keeper`."""
         self._new.append((self._walked[-1], self._place[rows], answer))
-        if time.monotonic() - self._last >= EVERY:
+        if time.monotonic() - self._last >= EVERY or sum(len(new) for _, new, _ in self._new) >= HELD:
             self._write()
 
     def settle(self) -> None:
@@ -259,6 +262,7 @@ class Partial:
         """See `Keeper`."""
         self.moments = [Answer(a.light, a.spread, a.paths, a.channels, 0.0) for a in answers]  # no copy
         self._before, self._place = {}, np.zeros(0, np.int32)
+        self._new.clear()
 
     def standing(self) -> str:
         """What is kept where, for a line of progress; empty before anything is."""
@@ -353,9 +357,13 @@ class Partial:
             walked, channels = self._walked[-1].stop, self.moments[0].channels
             named = {"names": channels.names, "mix": channels.mix}
             about = {"identity": self.about, "chosen": self.chosen, "queries": self._asked, "channels": named}
-            arrays: Any = {key: np.concatenate([getattr(a, key) for a in self.moments]) for key in MOMENT_ARRAYS}
-            with disk.fresh_file(finished / MOMENTS) as file:
-                np.savez_compressed(file, about=np.array(json.dumps(about)), walked=np.array(walked), **arrays)
+            texts = {"about": np.array(json.dumps(about)), "walked": np.array(walked)}
+            with disk.fresh_file(finished / MOMENTS) as file, ZipFile(file, "w", ZIP_DEFLATED) as packed:
+                for key in (*texts, *MOMENT_ARRAYS):  # as `numpy.savez_compressed`, which wants all of them at once
+                    with packed.open(f"{key}.npy", "w", force_zip64=True) as member:
+                        parts = [texts[key]] if key in texts else [getattr(a, key) for a in self.moments]
+                        np.lib.format.write_array(member, parts[0] if len(parts) == 1 else np.concatenate(parts))
+            self.moments.clear()
         self.remove()
 
     def remove(self) -> None:

@@ -1,9 +1,10 @@
 """A sweep through the isovalues as a film: one exposure, one camera, the isovalue in a corner of each frame."""
 
 import importlib.util
-import io
-from collections.abc import Callable, Iterator
-from typing import Any
+import math
+from collections.abc import Callable, Iterable, Iterator
+from tempfile import TemporaryFile
+from typing import IO, Any
 
 import numpy as np
 
@@ -38,44 +39,88 @@ def check_ending(name: str, ending: str) -> None:
         )
 
 
-def film(pictures: list[Picture], ending: str) -> bytes:
-    """Pictures of one size as a film that starts again at its end: ``.gif``, ``.webp`` or ``.mp4``."""
-    shown_for = min(max(SECONDS / len(pictures), SHORTEST), LONGEST)
+def film(pictures: Iterable[Picture], count: int, ending: str, out: IO[bytes]) -> None:
+    """Write `count` pictures of one size as a film that starts again at its end: ``.gif``, ``.webp`` or ``.mp4``.
+
+    Each is encoded when it comes and then let go: the memory does not grow with their number, but for the encoded film.
+    """
+    shown_for = min(max(SECONDS / count, SHORTEST), LONGEST)
     if ending == ".mp4":
-        return _mp4(pictures, 1 / shown_for)
-    from PIL import Image
-
-    options: dict[str, Any]
-    if ending == ".gif":
-        images, options = _one_palette(pictures), {"optimize": False, "disposal": 1}
+        out.write(_mp4(pictures, 1 / shown_for))
+    elif ending == ".gif":
+        _gif(pictures, count, round(1000 * shown_for), out)
     else:
-        images, options = [Image.fromarray(p) for p in pictures], {"quality": 88, "method": 4}
-    buffer = io.BytesIO()
-    images[0].save(
-        buffer, ending[1:], save_all=True, append_images=images[1:], duration=round(1000 * shown_for), loop=0, **options
-    )
-    return buffer.getvalue()
+        from PIL import Image
+
+        later = _Later(iter(pictures), count - 1)
+        later.seek(0)
+        options: dict[str, Any] = {"quality": 88, "method": 4, "duration": round(1000 * shown_for), "loop": 0}
+        Image.fromarray(later.picture).save(out, "WEBP", save_all=True, append_images=[later] * (count > 1), **options)
 
 
-def _one_palette(pictures: list[Picture]) -> list[Any]:
-    """Reduce to 256 colours that all frames share: a palette for each would flicker."""
-    from PIL import Image
+class _Later:
+    """The pictures after the first as one image of several frames, each taken when Pillow goes to it."""
 
-    some = pictures[:: max(1, len(pictures) // 8)]
-    together = Image.fromarray(np.concatenate([p[::2, ::2] for p in some]))
-    palette = together.quantize(256, method=Image.Quantize.FASTOCTREE)
-    return [Image.fromarray(p).quantize(palette=palette, dither=Image.Dither.FLOYDSTEINBERG) for p in pictures]
+    def __init__(self, pictures: Iterator[Picture], count: int) -> None:
+        self.pictures, self.n_frames = pictures, count
+
+    def seek(self, number: int) -> None:
+        """Go on to the next picture."""
+        self.picture = next(self.pictures)
+
+    def __getattr__(self, name: str) -> Any:
+        from PIL import Image
+
+        return getattr(Image.fromarray(self.picture), name)
 
 
-def _mp4(pictures: list[Picture], rate: float) -> bytes:
+def _gif(pictures: Iterable[Picture], count: int, duration: int, out: IO[bytes]) -> None:
+    """Frames of 256 colours that all share: a palette for each would flicker. They wait on the disk for it."""
+    from PIL import Image, ImageChops
+    from PIL.GifImagePlugin import getdata, getheader
+
+    some: list[Picture] = []
+    with TemporaryFile(prefix="illumgrid-") as waiting:
+        for number, picture in enumerate(pictures):
+            waiting.write(np.ascontiguousarray(picture).data)
+            if number % max(1, count // 8) == 0:
+                some.append(picture[::2, ::2].copy())
+        shape = picture.shape
+        del picture
+        palette = Image.fromarray(np.concatenate(some)).quantize(256, method=Image.Quantize.FASTOCTREE)
+        waiting.seek(0)
+
+        def frames_of() -> Iterator[Image.Image]:
+            for _ in range(count):
+                now = np.frombuffer(waiting.read(math.prod(shape)), np.uint8).reshape(shape)
+                yield Image.fromarray(now).quantize(palette=palette, dither=Image.Dither.FLOYDSTEINBERG)
+
+        later = frames_of()
+        before = part = next(later)
+        corner, lasts = (0, 0), duration
+        out.writelines(getheader(part.copy(), info={"loop": 0, "duration": duration, "optimize": False})[0])
+        for frame in later:
+            if (box := ImageChops.subtract_modulo(frame, before).getbbox()) is None:
+                lasts += duration  # nothing changed
+                continue
+            out.writelines(getdata(part, corner, duration=lasts, disposal=1))
+            before, part, corner, lasts = frame, frame.crop(box), box[:2], duration
+        out.writelines(getdata(part, corner, duration=lasts, disposal=1))
+        out.write(b";")
+
+
+def _mp4(pictures: Iterable[Picture], rate: float) -> bytes:
     import imageio.v3 as imageio
 
-    height, width = pictures[0].shape[:2]
-    odd = (0, height % 2), (0, width % 2), (0, 0)  # H.264 halves its colours: sides are even
-    even = np.stack([np.pad(p, odd, mode="edge") for p in pictures])
+    def even() -> Iterator[Picture]:  # H.264 halves its colours: sides are even
+        for picture in pictures:
+            height, width = picture.shape[:2]
+            yield np.pad(picture, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
+
+    each: Any = even()  # taken one by one, though the types of imageio say otherwise
     return bytes(
         imageio.imwrite(
-            "<bytes>", even, extension=".mp4", plugin="FFMPEG", fps=rate, codec="libx264", quality=8,
+            "<bytes>", each, is_batch=True, extension=".mp4", plugin="FFMPEG", fps=rate, codec="libx264", quality=8,
             macro_block_size=2, pixelformat="yuv420p",
         )
     )  # fmt: skip

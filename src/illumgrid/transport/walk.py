@@ -19,6 +19,10 @@ SECONDS = 2.0
 """That a piece should take: later ones are sized by the pace of those before."""
 AT_ONCE = 0.25
 """The same where somebody looks on, and may look elsewhere before the next piece."""
+MOST = 1 << 16
+"""Targets of a piece, whose queries and answers are held beside those of the whole walk."""
+LOOKED_AT = 1 << 22
+"""Targets among which the next ones are looked for at a time."""
 GROWTH = 4.0
 """How many times larger, or smaller, the next piece may be."""
 
@@ -112,19 +116,22 @@ class Walk:
         ranks = ranks or [np.zeros(len(q), np.int8) for q in self.targets]
         for now in sorted({int(r) for each in ranks for r in np.unique(each)}):
             for number, (queries, paths, known) in enumerate(zip(self.targets, self.ranges, self.answers)):
-                due = ranks[number] == now
-                rows = np.flatnonzero(due if known is None else due & (known.paths < 0))
-                while len(rows):
-                    some, rows = np.split(rows, [max(1, int(self.size / max(len(paths), 1)))])
-                    self.asked.append((number, some))
-                    yield queries[slice(None) if len(some) == len(queries) else some], paths
+                for rows in _due(ranks[number], now, known):
+                    while len(rows):
+                        some, rows = np.split(rows, [self._most(paths)])
+                        self.asked.append((number, some))
+                        yield queries[slice(None) if len(some) == len(queries) else some], paths
 
     def wanted(self, choose: Chooser) -> Iterator[tuple[Queries, range]]:
         """What is not known yet, each piece as it is chosen, once the one before is answered."""
         while (unknown := self._unknown()).any():
-            number, rows = choose(unknown, [max(1, int(self.size / max(len(p), 1))) for p in self.ranges])
+            number, rows = choose(unknown, [self._most(paths) for paths in self.ranges])
             self.asked.append((number, rows))
             yield self.targets[number][rows], self.ranges[number]
+
+    def _most(self, paths: range) -> int:
+        """Targets of the next piece."""
+        return min(max(1, int(self.size / max(len(paths), 1))), MOST)
 
     def _unknown(self) -> NDArray[np.bool_]:
         each = (np.ones(len(q), bool) if a is None else a.paths < 0 for q, a in zip(self.targets, self.answers))
@@ -147,6 +154,14 @@ class Walk:
         for own, new in zip((whole.light, whole.spread, whole.paths), arrays):
             own[rows] = new
         return number, rows
+
+
+def _due(ranks: NDArray[np.integer], now: int, known: Samples | None) -> Iterator[NDArray[np.int64]]:
+    """Rows of one rank that are not known, some after the other: their numbers take more than what is known of them."""
+    for first in range(0, len(ranks), LOOKED_AT):
+        some = slice(first, first + LOOKED_AT)
+        due = ranks[some] == now
+        yield first + np.flatnonzero(due if known is None else due & (known.paths[some] < 0))
 
 
 def in_order(ranks: Ranks) -> NDArray[np.int64]:
