@@ -1,6 +1,7 @@
-"""The default of `run` before and now, on ten volumes: ``python benchmarks/defaults.py [VOLUME...] [--old PYTHON]``.
+"""The default of `run` before and now, on real volumes: ``python benchmarks/defaults.py [VOLUME...] [--old PYTHON]``.
 
-Each volume of RANGES (`chart.py`) under a white sky: error of the grid at points on level sets that no run visits, read
+Each volume of RANGES (`chart.py`) under a white sky; with ``--scene studio`` each volume there is, in its suggested
+range and the light that `run` gives it by default. Error of the grid at points on level sets that no run visits, read
 trilinearly as it is displayed, against one converged reference, and processor seconds of `run` (user and system, all
 threads, kernels loaded, without reading, judging and writing). References are kept in ``--keep``, so that repeated
 trials cost only their runs.
@@ -28,7 +29,8 @@ import inspect, json, sys, time, warnings
 import numpy as np
 warnings.simplefilter("ignore")
 import illumgrid as ig
-file, low, high, sigma, points, out, options = sys.argv[1:]
+file, lit, limits, sigma, points, out, options = sys.argv[1:]
+made = getattr(ig.Scene, lit)
 options = json.loads(options)
 if "density" in options:
     options["interpolator"] = ig.interpolator("bilateral", density=options.pop("density"))
@@ -37,7 +39,7 @@ if float(sigma):
     from scipy.ndimage import gaussian_filter
     soft = gaussian_filter(np.asarray(volume.values, np.float32), float(sigma), mode="nearest")
     volume = ig.Volume(soft, volume.origin, volume.spacing, volume.direction)
-scene = ig.Scene.sky(volume, range=(float(low), float(high)))
+scene = made(volume, range=json.loads(limits))
 per_voxel = options.pop("nodes", None)
 if per_voxel:
     options["grid"] = round(per_voxel * max(volume.shape))
@@ -47,7 +49,7 @@ x = np.stack(np.meshgrid(*[np.linspace(-1, 1, 16)] * 3, indexing="ij"), -1)
 kind = getattr(volume, "stored", volume.values).dtype  # kernels are compiled for each type of values
 small = (90 + 60 * np.sin(3 * x).prod(-1) + 30 * x[..., 0]).astype(kind)
 for bounces in (2, 6, None):  # loads what is compiled, the cache among it
-    ig.run(ig.Scene.sky(ig.Volume(small), range=(70, 120)), isovalues=4,
+    ig.run(made(ig.Volume(small), range=(70, 120)), isovalues=4,
            **{**options, "paths": 2, "bounces": bounces, **({"grid": 8} if "grid" in options else {})})
 busy, wall = time.process_time(), time.perf_counter()
 light = ig.run(scene, isovalues=4, seed=3, **options)
@@ -59,9 +61,9 @@ np.save(out + ".npy", light_at)
 """
 
 
-def reference(file, limits, sigma, keep):
+def reference(file, lit, limits, sigma, keep):
     """Points (n, 3), their light (n, 3) and its half-difference (n, 3), computed once."""
-    place = keep / f"{file.name.split('.')[0]}-{sigma:g}.npz"
+    place = keep / f"{file.name.split('.')[0]}-{sigma:g}{'' if lit == 'sky' else '-' + lit}.npz"
     if not place.exists():
         from illumgrid import Scene, backend, read_volume
         from illumgrid.accuracy.points import unseen_on_level_sets
@@ -70,7 +72,7 @@ def reference(file, limits, sigma, keep):
         from illumgrid.transport.tracer import prepare
 
         volume = read_volume(file)
-        scene = Scene.sky(smooth(volume, sigma) if sigma else volume, range=limits)
+        scene = getattr(Scene, lit)(smooth(volume, sigma) if sigma else volume, range=limits)
         tracer = prepare(backend("numba"), scene)
         asked = unseen_on_level_sets(scene, LEVELS, POINTS, SEED)
         bounces = enough(scene, tracer, 3e-4, SEED)
@@ -82,12 +84,13 @@ def reference(file, limits, sigma, keep):
         return stored["points"], stored["light"], stored["off"]
 
 
-def measured(python, file, limits, sigma, exact, options):
+def measured(python, file, lit, limits, sigma, exact, options):
     """Error (relative RMSE, its spread, median, bias) and what the run says about itself."""
     points, light, off = exact
     with tempfile.TemporaryDirectory() as folder:
         np.save(Path(folder) / "points.npy", points)
-        given = [str(file), *map(str, limits), str(sigma), f"{folder}/points.npy", f"{folder}/out", json.dumps(options)]
+        given = [str(file), lit, json.dumps(limits), str(sigma), f"{folder}/points.npy", f"{folder}/out"]
+        given.append(json.dumps(options))
         own = {k: v for k, v in os.environ.items() if k != "PYTHONPATH" or python == sys.executable}
         try:
             subprocess.run([python, "-c", CHILD, *given], check=True, env=own, capture_output=True, text=True)
@@ -118,7 +121,8 @@ def main():
     from chart import RANGES
 
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("names", nargs="*", help="beginnings of file names; by default all ten")
+    parser.add_argument("names", nargs="*", help="beginnings of file names; by default all")
+    parser.add_argument("--scene", choices=("sky", "studio"), default="sky")
     parser.add_argument("--volumes", type=Path, default=ROOT.parent / "shared" / "volumes")
     parser.add_argument("--keep", type=Path, default=Path(tempfile.gettempdir()) / "illumgrid-references")
     parser.add_argument("--old", help="Python interpreter of the version to compare with")
@@ -129,17 +133,18 @@ def main():
     asked = parser.parse_args()
     warnings.simplefilter("ignore")
     figures = {}
-    for name, limits in RANGES.items():
+    studio = {file.name: None for file in sorted(asked.volumes.glob("*.*")) if file.name != "SOURCES.md"}
+    for name, limits in (RANGES if asked.scene == "sky" else studio).items():
         file = asked.volumes / name
         if not file.exists() or (asked.names and not name.startswith(tuple(asked.names))):
             continue
-        exact = reference(file, limits, asked.smooth, asked.keep)
+        exact = reference(file, asked.scene, limits, asked.smooth, asked.keep)
         runs = [(asked.old, "old default", {})] if asked.old else []
         runs += [] if asked.no_default else [(sys.executable, "default", {})]
         runs += [(sys.executable, json.dumps(options), options) for options in asked.tried]
         figures[name] = {}
         for python, label, options in runs:
-            figures[name][label] = m = measured(python, file, limits, asked.smooth, exact, options)
+            figures[name][label] = m = measured(python, file, asked.scene, limits, asked.smooth, exact, options)
             print(f"{name.split('.')[0]:14} {label}: {line(m)} (reference {m['reference']:.2%})", flush=True)
     if asked.old and not asked.no_default:
         both = [(m["old default"], m["default"]) for m in figures.values()]

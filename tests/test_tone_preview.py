@@ -8,7 +8,7 @@ from PIL import Image
 
 from illumgrid.field.scene import Field, Material, Scene
 from illumgrid.field.volume import Volume
-from illumgrid.show import BACKGROUND, CAP_TONE, fit_camera, png, render
+from illumgrid.show import BACKGROUND, fit_camera, png, render
 from illumgrid.tone import WHITE, automatic_exposure, curve, encode_srgb
 from shapes import lit, relit, sampled, sky
 
@@ -203,16 +203,6 @@ def test_the_camera_holds_the_whole_object_and_little_else(size, isovalue):
 def test_an_empty_isosurface_is_background_only(local):
     picture = render(lit(sky()), isovalue=1.19, local=local, **SIZE)
     assert (picture == GROUND).all() and picture.shape == (90, 120, 3) and picture.dtype == np.uint8
-
-
-def test_caps_are_drawn_in_a_plain_tone_whatever_the_light():
-    # cut open at the front
-    half = sampled(lambda x: 1.2 - np.linalg.norm(x, axis=1), (20, 12, 20), (-1, 0, -1), (0.105,) * 3)
-    pictures = [render(lit(sky(half, albedo=(0.9, 0.6, 0.3)), value), **SIZE) for value in (0.5, 2.0)]
-    cap = encode_srgb(CAP_TONE * np.array([0.9, 0.6, 0.3]))
-    plain = (pictures[0] == cap).all(axis=2)
-    assert 0.15 < plain.mean() < 0.6
-    assert np.array_equal(plain, (pictures[1] == cap).all(axis=2))
 
 
 def test_a_surface_is_shown_at_albedo_over_pi_times_its_light_times_the_exposure():

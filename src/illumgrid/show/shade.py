@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from illumgrid.field.scene import Scene
 from illumgrid.field.volume import Floats
 from illumgrid.light import Illumination
+from illumgrid.show.caps import light_on_caps
 from illumgrid.show.cuts import Clip
 from illumgrid.show.looks import Sight, dimmed, displayed, sight_of
 from illumgrid.show.tints import Tint
@@ -17,9 +18,7 @@ from illumgrid.show.trust import trust_colors
 from illumgrid.tone import WHITE, curve, luminance
 
 BACKGROUND = 0.045  # display-linear: a dark neutral, against which white surfaces and their shadows both stand out
-CAP_TONE = (
-    0.45  # display radiance of a cap, for albedo 1: a cut carries no light, and a dark tone would look like a hole
-)
+CAP_TONE = 0.45  # display radiance of a cap of albedo 1 whose light is not known: a dark one would look like a hole
 
 Colors = NDArray[np.float32]
 
@@ -138,10 +137,25 @@ class Shown:
             shown = shown * coat.matte[:, None].astype(np.float32) + coat.radiance * np.float32(self.exposure)
         return curve(shown)
 
-    def cap(self, number: int) -> Colors:
-        """Colour (3,) of the cuts through the solid of a field."""
+    @cached_property
+    def caps(self) -> tuple[Colors, ...]:
+        """Irradiance of the faces of each field's box: see `illumgrid.show.caps.light_on_caps`."""
+        return tuple(light_on_caps(self.light, number) for number in range(len(self.scene.fields)))
+
+    def cap(self, number: int, points: Floats, face: NDArray[np.integer], facing: Floats) -> Colors:
+        """Colours (n, 3) of caps of a field at world points (n, 3) on these faces (n,) of its box, -1 on inner sides.
+
+        A plain tone where their light is not known, and in pictures of its uncertainty.
+        """
+        if self.local and not self.trust:
+            return self.field(number, points, facing)
         albedo = np.full(3, 0.5) if self.trust else self.displayed.fields[number].material.albedo
-        return (CAP_TONE * albedo).astype(np.float32)
+        color = np.tile((CAP_TONE * albedo).astype(np.float32), (len(points), 1))
+        if not self.trust:
+            light = self.caps[number][face]
+            lit = np.flatnonzero((face >= 0) & np.isfinite(light[:, 0]))
+            color[lit] = self.field(number, points[lit], facing[lit], light[lit])
+        return color
 
     def wall(self, number: int, u: Floats, v: Floats, facing: Floats, light: Colors | None = None) -> Colors:
         """Colours (n, 3) of the front of a quad at shares u, v (n,) of its edges; `light` as for `field`."""

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from illumgrid.field.levelset import isosurface
 from illumgrid.field.scene import Field
 from illumgrid.field.volume import Floats, outward_normals, world_to_index
+from illumgrid.show.caps import face_normals
 from illumgrid.show.shade import Colors, Shown
 
 WALL_STEPS = 4  # squares along each side of a texel: what is bilinear between texels is then linear to the eye
@@ -52,26 +53,30 @@ def solid(shown: Shown, number: int, field: Field, eye: Floats) -> list[Colored]
         return []
     points = np.asarray(mesh.vertices)
     index = world_to_index(field.volume, points)
-    cut = _caps(index, mesh.faces, field)
+    face = _caps(index, mesh.faces, field)
     facing = np.zeros(len(points))
     if shown.local or shown.trust:
         toward = eye - points
         toward /= np.linalg.norm(toward, axis=1, keepdims=True)
         normals = outward_normals(field.volume, index, field.inside) @ field.volume.direction.T
         facing = np.einsum("ij,ij->i", normals, toward)
-    caps = np.tile(shown.cap(number), (len(points), 1))
-    return [
-        Colored(points, mesh.faces[~cut], shown.field(number, points, facing)),
-        Colored(points, mesh.faces[cut], caps),
-    ]
+    found = [Colored(points, mesh.faces[face < 0], shown.field(number, points, facing))]
+    for k, normal in enumerate(face_normals(field.volume)):
+        used, faces = np.unique(mesh.faces[face == k], return_inverse=True)
+        if len(used):
+            toward = eye - points[used]
+            facing = toward @ normal / np.linalg.norm(toward, axis=1)
+            colors = shown.cap(number, points[used], np.full(len(used), k), facing)
+            found.append(Colored(points[used], faces.reshape(-1, 3), colors))
+    return found
 
 
-def _caps(index: Floats, faces: NDArray[np.integer], field: Field) -> NDArray[np.bool_]:
-    """Which faces (m,) lie in a face of the volume: the mesh is exact there."""
-    cut = np.zeros(len(faces), dtype=bool)
+def _caps(index: Floats, faces: NDArray[np.integer], field: Field) -> NDArray[np.int64]:
+    """The face of the volume (m,) in which each face of the mesh lies, -1 for none: the mesh is exact there."""
+    cut = np.full(len(faces), -1)
     for axis, last in enumerate(np.array(field.volume.shape) - 1):
-        for plane in (0, last):
-            cut |= (index[:, axis] == plane)[faces].all(axis=1)
+        for end, plane in enumerate((0, last)):
+            cut[(index[:, axis] == plane)[faces].all(axis=1)] = 2 * axis + end
     return cut
 
 

@@ -11,6 +11,7 @@ from illumgrid.constants import CAP, SURFACE
 from illumgrid.field.levelset import turned_levels
 from illumgrid.field.volume import Floats
 from illumgrid.show.camera import Camera
+from illumgrid.show.caps import face_normals, faces_at
 from illumgrid.show.cuts import CUT, greys
 from illumgrid.show.looks import Layer, arriving, coated, layers_of
 from illumgrid.show.shade import Coat, Colors, Shown, opaque
@@ -102,7 +103,12 @@ def colors_of(
     """Colours (n, 4) of what is met, lit by lookups, or by irradiance `light` (n, 3), perhaps under coats."""
     color = np.tile(background, (len(hits.what), 1))
     for k in range(len(shown.scene.fields)):
-        color[(hits.number == k) & (hits.what == CAP)] = opaque(shown.cap(k))
+        caps = np.flatnonzero((hits.number == k) & (hits.what == CAP))
+        if len(caps):
+            face = faces_at(shown.scene.fields[k].volume, hits.point[caps])
+            outer = np.einsum("ij,ij->i", hits.normal[caps], face_normals(shown.scene.fields[k].volume)[face]) > 0
+            face = np.where(outer, face, -1)
+            color[caps] = opaque(shown.cap(k, hits.point[caps], face, hits.facing[caps]))
         cut = np.flatnonzero((hits.number == k) & (hits.what == CUT))
         if len(cut):
             color[cut] = opaque(greys(shown.scene.fields[k], hits.point[cut]))

@@ -15,11 +15,12 @@ from illumgrid.field.layers import layers_of
 from illumgrid.field.scene import Field, Scene
 from illumgrid.field.upright import axes_of, up_of
 from illumgrid.field.volume import Floats, Lattice, box_corners, histogram
-from illumgrid.grid.channels import Channels
+from illumgrid.grid.channels import Channels, mixed
 from illumgrid.grid.nodes import reachable
 from illumgrid.light import Illumination
 from illumgrid.show import cuts, trust
 from illumgrid.show.camera import HALF_ANGLE, fit_camera, outline_of
+from illumgrid.show.caps import channels_on_caps, light_on_caps
 from illumgrid.show.looks import displayed
 from illumgrid.show.shade import BACKGROUND, CAP_TONE, fades
 from illumgrid.show.tints import Tint
@@ -135,9 +136,26 @@ def _field(light: Illumination, number: int, stage: Stage, into: Bytes, notes: l
         "values": pack_values(steps, into)
         | {"base": base * field.volume.slope + sign * field.volume.intercept, "step": step * field.volume.slope},
         "light": shown,
+        "caps": _caps(light, number),
         "toIndex": stage.to_index(volume).T.ravel().tolist(),
         "toTexture": (texture @ stage.to_index(grid.spec)).T.ravel().tolist(),
     }
+
+
+def _caps(light: Illumination, number: int) -> dict[str, Any]:
+    """Exposed light of the faces of a field's box, -1 where it is not known, and what each light or sky adds to it."""
+    scale, sky, apart = light.exposure / np.pi, skies.sky_of(light), kept_apart(light)
+    found, channels = channels_on_caps(light, number)
+    shown = np.nan_to_num(light_on_caps(light, number) * np.float32(scale), nan=-1.0)
+    described: dict[str, Any] = {"shown": shown.tolist(), "layers": [], "sky": None, "rest": None}
+    if apart:
+        only = [{name: float(name == one) for name in apart} for one in apart]
+        mixes = [np.array(mixed(channels, layers_of(light.scene), weights).mix) for weights in only]
+        described["layers"] = [(scale * found @ mix).tolist() for mix in mixes]
+    if sky:
+        held = skies.answers(light, sky, (scale * found).astype(np.float32), channels)
+        described |= {"sky": held.light[:, 0].tolist(), "rest": held.rest.tolist()}
+    return described
 
 
 def _note_reduced(

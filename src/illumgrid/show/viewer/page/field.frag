@@ -8,6 +8,7 @@ uniform bool uTint;                  // colours of a second quantity
 uniform sampler3D uSecond;
 uniform sampler2D uMap;
 uniform mat4 uToSecond;
+uniform vec3 uCaps[6];               // exposed light of the faces of the box: of each axis the first, then the last; below 0 if not known
 
 in vec3 vRay;
 
@@ -26,6 +27,13 @@ float doubt(vec3 place) {
     error += share * e;
   }
   return error;
+}
+
+// The face of the box next to a place.
+int faceAt(vec3 index) {
+  vec3 low = abs(index), high = abs(index - vec3(textureSize(uField, 0) - 1)), near = min(low, high);
+  int axis = near.x <= near.y && near.x <= near.z ? 0 : near.y <= near.z ? 1 : 2;
+  return 2 * axis + (high[axis] < low[axis] ? 1 : 0);
 }
 
 void main() {
@@ -49,24 +57,28 @@ void main() {
     draw(vec3(grey <= 0.04045 ? grey / 12.92 : pow((grey + 0.055) / 1.055, 2.4)), 1.0);
     return;
   }
-  if (what == CAP) { draw(uCapTone * (isTrust() ? vec3(0.5) : uAlbedo), 1.0); return; }
   vec3 texel = (uToTexture * vec4(place, 1.0)).xyz;
-  bool local = isLocal();
-  vec3 normal = vec3(0.0);
-  if (local || uLook != MATTE || uRough >= 0.0 || isTrust()) {
+  bool local = isLocal(), cap = what == CAP;
+  vec3 normal = vec3(0.0), color, light;
+  if (cap) {
+    int face = faceAt((uToIndex * vec4(place, 1.0)).xyz);
+    light = uCaps[face];
+    if (isTrust() || (light.r < 0.0 && !local)) { draw(uCapTone * (isTrust() ? vec3(0.5) : uAlbedo), 1.0); return; }
+    normal = (face % 2 == 0 ? -1.0 : 1.0) * normalize(transpose(mat3(uToIndex))[face / 2]);
+  } else if (local || uLook != MATTE || uRough >= 0.0 || isTrust()) {
     normal = -normalize(transpose(mat3(uToIndex)) * gradient((uToIndex * vec4(place, 1.0)).xyz));
   }
   float facing = abs(dot(normal, ray));
   if (isTrust()) { draw(trusted(doubt(texel)) * (0.4 + 0.6 * facing), 1.0); return; }
-  vec3 color, light = lightOf(texture(uLight, texel));
+  if (!cap) light = lightOf(texture(uLight, texel));
   if (local) color = uGain * uWhite * uAlbedo / max(most(uAlbedo), 1e-9) * max(-dot(normal, ray), uBothSides ? facing : 0.0);
   else color = uGain * uAlbedo * light;
   if (uTint) {
     vec3 base = texture(uMap, vec2(texture(uSecond, (uToSecond * vec4(place, 1.0)).xyz).r * 255.0 / 256.0 + 0.5 / 256.0, 0.5)).rgb;
     color = base * (local ? facing * uGain * uWhite : dot(curve(uGain * light), vec3(0.2126, 0.7152, 0.0722)));
   }
-  if (!uRaw && (uLook == SHINY || uRough >= 0.0)) color = 0.8 * color + gloss(normal, ray, local ? vec3(uWhite) : light);
-  float there = opaque(facing);
+  if (!uRaw && !cap && (uLook == SHINY || uRough >= 0.0)) color = 0.8 * color + gloss(normal, ray, local ? vec3(uWhite) : light);
+  float there = cap ? 1.0 : opaque(facing);
   if (uLook != TRANSLUCENT) color *= there;   // the tone curve sees what the surface adds, as in the pictures
   draw(uTint ? color : curve(color), 1.0);
   color_.a = there;

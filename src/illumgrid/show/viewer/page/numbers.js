@@ -85,6 +85,15 @@ export function mixedTexels(bytes, about, weights, sky) {
   return texels;
 }
 
+// Exposed light of the faces of a field's box, 18 numbers, with its lights at these weights or under a sky with these coefficients.
+export function capLight({ shown, layers, sky, rest }, weights, turned) {
+  const mixed = (face, k) => {
+    if (layers.length) return layers.reduce((sum, layer, j) => sum + weights[j] * layer[face][k], 0);
+    return turned && sky ? sky[face].reduce((sum, f, b) => sum + f * turned[b][k], rest[face][k]) : shown[face][k];
+  };
+  return shown.flatMap((color, face) => color.map((known, k) => (known < 0 ? -1 : Math.max(0, mixed(face, k)))));
+}
+
 // Least and largest value over the 5³ voxels of each brick: rays jump over bricks that no level set crosses.
 export function bricks(values, [nx, ny, nz]) {
   const shape = [nx, ny, nz].map((n) => Math.ceil((n - 1) / BRICK));

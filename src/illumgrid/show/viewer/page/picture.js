@@ -1,6 +1,6 @@
 // Draws one picture: layers of fields and walls, summed over places within the pixel, then shown.
 
-import { bricks, fieldValues, lightTexels, mixedTexels } from "./numbers.js";
+import { bricks, capLight, fieldValues, lightTexels, mixedTexels } from "./numbers.js";
 import { dot, eyeOf, facing, sum } from "./camera.js";
 import { skyTurned } from "./skies.js";
 import { DEFAULTS, isovalueOf } from "./state.js";
@@ -108,7 +108,7 @@ export class Picture {
   mix({ weights, turn }) {
     if (!this.data || this.mixed === String([weights, turn])) return;
     this.mixed = String([weights, turn]);
-    const sky = this.scene.sky && skyTurned(this.scene.sky.coefficients, turn);
+    const sky = this.turned = this.scene.sky && skyTurned(this.scene.sky.coefficients, turn);
     const gl = this.gl, lit = this.scene.fields.map((field, k) => [this.fields[k].light, field.light]);
     for (const [texture, about] of this.walls ? [...lit, [this.walls, this.scene.atlas]] : lit) {
       gl.bindTexture(gl.TEXTURE_3D, texture);
@@ -186,7 +186,7 @@ export class Picture {
     gl.useProgram(this.fieldProgram.built);
     set(gl, this.fieldProgram, common);
     scene.fields.forEach((field, k) => {
-      set(gl, this.fieldProgram, { ...this.fieldTextures(k), ...this.fieldUniforms(field, k, state), uRough: field.rough ?? -1, uWindow: field.window });
+      set(gl, this.fieldProgram, { ...this.fieldTextures(k), ...this.fieldUniforms(field, k, state), "uCaps[0]": capLight(field.caps, state.weights, this.turned), uRough: field.rough ?? -1, uWindow: field.window });
       gl.drawArrays(gl.TRIANGLES, 0, 3);
     });
     gl.useProgram(this.wallProgram.built);
