@@ -26,7 +26,7 @@ def faces_at(volume: Volume, points: Floats) -> NDArray[np.int64]:
     """The face (n,) next to each of the world points (n, 3)."""
     index = world_to_index(volume, points)
     away = np.stack([index, index - (np.array(volume.shape) - 1)], axis=-1) * volume.spacing[:, None]
-    return np.abs(away).reshape(len(points), 6).argmin(axis=1)
+    return np.asarray(np.abs(away).reshape(len(points), 6).argmin(axis=1), np.int64)
 
 
 def open_faces(scene: Scene, number: int) -> NDArray[np.bool_]:
