@@ -18,7 +18,7 @@ from illumgrid.accuracy.probe import FEWEST_PATHS, MOST_PATHS
 from illumgrid.bake import Baked, bake
 from illumgrid.bake.accumulator import Map, Progress
 from illumgrid.bake.ahead import light_ahead
-from illumgrid.bake.bounces import enough_bounces, light_left_out
+from illumgrid.bake.bounces import enough_bounces, has_long_paths, light_left_out
 from illumgrid.bake.refined import MOST
 from illumgrid.constants import BASE, PATHS
 from illumgrid.errors import BadInput, tell, tell_after
@@ -33,9 +33,6 @@ from illumgrid.stages import Backend, Interpolator, Sampler
 from illumgrid.transport.stages import capabilities
 from illumgrid.transport.tracer import Tracer, prepare
 from illumgrid.transport.walk import RunKeeper
-
-MANY_BOUNCES = 4
-"""More reflections than these, and a coarse grid pays that is lit first: paths are long, and most of them end there."""
 
 
 def load(folder: str | os.PathLike[str]) -> Illumination:
@@ -88,7 +85,7 @@ def run(
         Light paths from every query; by default 32; 8 to 64 where a first look chooses the nodes.
     bounces : int, optional
         Reflections; 0 is light straight from background and lamps. By default as many as leave out less than 1 % of
-        the light, and at least 4; paths end in the light of the first look where that is known well, or, where it
+        the light, and at least 8; paths end in the light of the first look where that is known well, or, where it
         takes more bounces, in a coarse grid that is lit first: see `illumgrid.bake.known.light_known_first`. A number
         given here is followed path by path.
     isovalues : int, optional
@@ -161,7 +158,7 @@ def run(
     if bounces is None:
         bounces, left_out = enough_bounces(scene, tracer, seed)
         marches = capabilities(chosen[1]).surface == "levelset" and hasattr(tracer, "cache")
-        cached = bounces > MANY_BOUNCES and not at_once and marches
+        cached = marches and not at_once and has_long_paths(scene, tracer, seed)
     elif not before:
         left_out = light_left_out(scene, tracer, bounces, seed)
     clock = time.perf_counter()

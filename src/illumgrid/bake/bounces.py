@@ -9,6 +9,13 @@ from illumgrid.transport.samples import Queries, join_queries
 from illumgrid.transport.tracer import Tracer
 
 
+LEAST = 8
+"""Reflections at least: the mean that is left out is less than what deep folds lose, and long paths are few."""
+SHORT = 4
+"""Reflections that bring 99 % of the light where paths are short."""
+LEFT_OUT = 0.01
+
+
 def _on_few_rows(scene: Scene, seed: int, rows: int = 4, count: int = 32) -> Queries:
     """About `count` queries on each of a few rows of the sweep, from the nodes of a coarse grid.
 
@@ -50,9 +57,14 @@ def light_left_out(scene: Scene, tracer: Tracer, bounces: int, seed: int = 0) ->
 
 
 def enough_bounces(scene: Scene, tracer: Tracer, seed: int = 0) -> tuple[int, float]:
-    """Reflections to follow, and the share of light left out: below 1 %, and at least 4 reflections."""
-    bounces, left_out = 4, light_left_out(scene, tracer, 4, seed)
-    while bounces < 128 and left_out >= 0.01:
+    """Reflections to follow, and the share of light left out: below 1 %, and at least `LEAST` reflections."""
+    bounces, left_out = LEAST, light_left_out(scene, tracer, LEAST, seed)
+    while bounces < 128 and left_out >= LEFT_OUT:
         bounces += max(1, bounces // 4)
         left_out = light_left_out(scene, tracer, bounces, seed)
     return bounces, left_out
+
+
+def has_long_paths(scene: Scene, tracer: Tracer, seed: int = 0) -> bool:
+    """Whether light needs many reflections: a coarse grid then pays that is lit first, since most paths end there."""
+    return light_left_out(scene, tracer, SHORT, seed) >= LEFT_OUT

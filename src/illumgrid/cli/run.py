@@ -80,7 +80,7 @@ def run(
         typer.Option(
             min=0,
             metavar="N",
-            help="Reflections. [default: until under 1 % is left out, at least 4]",
+            help="Reflections. [default: until under 1 % is left out, at least 8]",
         ),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, max=2**64 - 1, metavar="N", help="Equal seeds give equal light.")] = 0,
