@@ -95,10 +95,10 @@ def test_a_scene_file_that_is_wrong_is_refused(refuse, corner):
 
 def test_bounces_follow_the_scene_and_what_they_leave_out_is_reported(call, tmp_path):
     options = ("run", "v.npy", "--range", "0.3", "0.9", "--albedo", "0.3", "0.3", "0.3", *QUICK)
-    assert "bounces beyond 4 would add" in call(*options, "-o", "open")
+    assert "bounces beyond 8 would add" in call(*options, "-o", "open")
     said = call(*options, "--scene", "box", "-o", "closed")
     made = recipe(tmp_path / "closed")
-    assert made["bounces"] > 4 and 0 <= made["left_out"] < 0.01
+    assert made["bounces"] >= 8 and 0 <= made["left_out"] < 0.01
     assert f"bounces beyond {made['bounces']} would add about {made['left_out']:.1%}" in said
     said = call(*options, "--scene", "box", "--bounces", "0", "-o", "straight")
     made = recipe(tmp_path / "straight")
