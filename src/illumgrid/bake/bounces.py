@@ -8,7 +8,6 @@ from illumgrid.samplers.direct import Direct
 from illumgrid.transport.samples import Queries, join_queries
 from illumgrid.transport.tracer import Tracer
 
-
 LEAST = 8
 """Reflections at least: the mean that is left out is less than what deep folds lose, and long paths are few."""
 SHORT = 4
