@@ -12,7 +12,7 @@ from illumgrid.backends.numba_ import Numba
 from illumgrid.bake.refined import MOST, Chosen, chosen, paths_for, read_choice, written
 from illumgrid.field.volume import interpolate, world_to_index
 from illumgrid.grid import GridSpec, IlluminationGrid, Nodes
-from illumgrid.grid.nested import coarser, doubled, finer, spread, within
+from illumgrid.grid.nested import coarser, finer, spread, within
 from illumgrid.grid.nodes import reachable
 from illumgrid.interpolators.bilateral import Bilateral
 from illumgrid.interpolators.nested import Nested
@@ -52,15 +52,6 @@ def test_every_second_node_of_the_finer_lattice_is_a_node():
     assert fine.shape == (13, 5, 9) and coarser(fine, 2).shape == spec.shape
     places = fine.nodes().reshape(*fine.shape, 3)[::4, ::4, ::4]
     np.testing.assert_allclose(places.reshape(-1, 3), spec.nodes(), rtol=1e-15)
-
-
-def test_between_nodes_linear_light_is_exact_and_the_least_is_that_of_the_neighbours():
-    index = np.indices((3, 4, 2)).astype(np.float32)
-    fine = np.indices((5, 7, 3)).astype(np.float32) / 2
-    np.testing.assert_array_equal(
-        doubled(1 + 2 * index[0] - index[1] + 3 * index[2]), 1 + 2 * fine[0] - fine[1] + 3 * fine[2]
-    )
-    assert (doubled(index[0], least=True)[:, 0, 0] == [0, 0, 1, 1, 2]).all()
 
 
 def test_a_cell_differs_by_its_corners_that_have_light():

@@ -49,8 +49,8 @@ def test_a_record_that_is_none(out, text):
 
 
 def test_a_format_of_the_future(out):
-    reseal(out, format=4)
-    with pytest.raises(BadInput, match=r"run\.json .* format is 4; illumgrid .* reads 1 to 3"):
+    reseal(out, format=5)
+    with pytest.raises(BadInput, match=r"run\.json .* format is 5; illumgrid .* reads 1 to 4"):
         store.read(out)
 
 

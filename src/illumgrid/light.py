@@ -151,7 +151,7 @@ class Illumination:
     @cached_property
     def exposure(self) -> float:
         """Automatic exposure: one for all isovalues, views and fields, from the light that the grids hold."""
-        count = sum(int((block.support > 0).sum()) for grid in self.grids for block in grid.blocks())
+        count = sum(len(lit) for grid in self.grids for lit in grid.lit_parts())
         if not count:
             return 1.0
         highlights = tone.DIRECTED if any(isinstance(one, Distant) for one in self.scene.lights) else tone.EVEN
@@ -168,8 +168,8 @@ class Illumination:
         """A number for each node that has light of its own, from the light (n, 3) of some and their albedo."""
         first = 0
         for field_, grid in zip(self.scene.fields, self.grids):
-            for block in grid.blocks():
-                found = worth(block.values[block.support > 0], field_.material.albedo)
+            for lit in grid.lit_parts():
+                found = worth(lit, field_.material.albedo)
                 out[first : first + len(found)] = found
                 first += len(found)
         return out

@@ -18,7 +18,7 @@ from illumgrid.bake.walls import texel_paths, wall_queries, wall_texture
 from illumgrid.field.scene import Levels, Scene
 from illumgrid.field.volume import interpolate, world_to_index
 from illumgrid.grid import GridSpec, IlluminationGrid, Nodes, WallTexture
-from illumgrid.grid.nodes import reachable
+from illumgrid.grid.nodes import reached
 from illumgrid.stages import Interpolator, Sampler
 from illumgrid.transport.stages import fill_nodes
 from illumgrid.transport.tracer import Tracer
@@ -60,8 +60,7 @@ class Baked:
 def holes_within_range(scene: Scene, field: int, grid: IlluminationGrid) -> int:
     """Nodes without support through which an isosurface of the range passes, outside the solids of other fields."""
     own = scene.fields[field]
-    near = reachable(own, grid.spec)
-    empty = near[grid.support.reshape(-1)[near] == 0]
+    empty = np.flatnonzero(grid.dark & reached(own, grid.spec))
     nodes = grid.spec.nodes(empty)
     level = interpolate(own.volume, world_to_index(own.volume, nodes))
     seen = (level >= own.range[0]) & (level <= own.range[1])
@@ -143,7 +142,7 @@ def bake(
         grids.append(fill_nodes(interpolator, samples, nodes_of))
         if scene.fields[number].isovalue is not None:
             lit = tuple(fill_nodes(interpolator, rows.pop(0), nodes_of) for _ in range(HELD_ROWS))
-            grids[-1] = replace(grids[-1], values=grids[-1].light, rows=lit)
+            grids[-1] = replace(grids[-1], rows=lit)
         del samples
         progress("grid", number + 1, len(specs))
     walls = [wall_texture(len(levels.table), quad, answer) for quad, answer in zip(scene.quads, answers)]

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from illumgrid.bake.accumulator import Bake, Map, Progress
 from illumgrid.field.scene import Scene
 from illumgrid.grid import GridSpec, IlluminationGrid, Nodes
-from illumgrid.grid.nested import finer, spread, within
+from illumgrid.grid.nested import all_corners, finer, spread, within
 from illumgrid.grid.nodes import reachable
 from illumgrid.interpolators.bilateral import read
 from illumgrid.rng import shifted_seed
@@ -111,7 +111,7 @@ def _of_field(
             grid, noise = _look(scene, number, spec, flat, tracer, bounces, seed, map, progress)
         asked = np.zeros(spec.shape, bool)
         asked.reshape(-1)[flat] = True
-        rough = np.where(_all_corners(asked), spread(grid), np.float32(0))
+        rough = np.where(all_corners(asked), spread(grid), np.float32(0))
         spec = finer(spec, 1)
         may = np.zeros(spec.shape, bool)
         may.reshape(-1)[reachable(field, spec)] = True
@@ -139,7 +139,11 @@ def _look(
         tracer, range(LOOKED), map, lambda what, done, total: progress("first look", done, total)
     )
     samples = looked.samples
-    grid, lit = nodes.grid(*read(samples, nodes, nodes, flat), samples.channels), samples.paths > 0
+    light = np.zeros((*spec.shape, len(samples.channels)), np.float32)  # holes stay dark: nobody reads them
+    error, support = np.full(spec.shape, np.inf, np.float32), np.zeros(spec.shape, np.float32)
+    for every, some in zip((light, error, support), read(samples, nodes, nodes, flat)):
+        every.reshape(-1, *every.shape[3:])[flat] = some
+    grid, lit = IlluminationGrid(spec, light, error, support, samples.channels), samples.paths > 0
     if not lit.any():
         return grid, 0.0
     return grid, float(np.median(samples.error[lit]) / np.sqrt(np.median(grid.support[grid.support > 0])))
@@ -157,13 +161,6 @@ def paths_for(choice: Choice, base: Sequence[GridSpec]) -> int:
         coarse += int((place % 2**choice.levels == 0).all(axis=0).sum())
     share = MOST_PATHS * (coarse / max(lit, 1)) ** 1.5
     return int(np.clip(2 ** np.floor(np.log2(max(share, 1.0))), FEWEST, MOST_PATHS))
-
-
-def _all_corners(nodes: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    for axis in range(3):
-        line = np.moveaxis(nodes, axis, 0)
-        nodes = np.moveaxis(line[1:] & line[:-1], 0, axis)
-    return nodes
 
 
 def written(choice: Choice, base: Sequence[GridSpec]) -> dict[str, Any]:

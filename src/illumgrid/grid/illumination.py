@@ -1,18 +1,19 @@
 """The illumination grid: light at the nodes of a lattice, with its error bar and its support."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from illumgrid.errors import BadInput
 from illumgrid.field.lattice import GridSpec
-from illumgrid.field.volume import Floats, corners, world_to_index
+from illumgrid.field.volume import world_to_index
+from illumgrid.grid.bars import of_blocks, resolution
+from illumgrid.grid.blocks import Layout, answer, read, whole
 from illumgrid.grid.channels import Channels, stored
-from illumgrid.grid.lookup import read_lattice
 
 _BLOCK = 1 << 18  # nodes
 
@@ -26,7 +27,22 @@ class Block(NamedTuple):
     support: NDArray[np.float32]  # (m,)
 
 
-@dataclass(frozen=True, eq=False)
+class Held(NamedTuple):
+    """What a grid holds, in blocks of nodes: see `illumgrid.grid.blocks`."""
+
+    layout: Layout
+    light: NDArray[np.float32]  # (blocks, i, j, k, C)
+    error: NDArray[np.float32]  # (blocks, i, j, k)
+    support: NDArray[np.float32]  # (blocks, i, j, k)
+    errors: NDArray[np.float32] | None = None  # (blocks, i, j, k, C)
+
+    @property
+    def size(self) -> int:
+        """Nodes, those on borders of several blocks counted in each."""
+        return self.support.size
+
+
+@dataclass(frozen=True, eq=False, init=False)
 class IlluminationGrid:
     """Light at every node, for the level set that passes through it.
 
@@ -47,6 +63,9 @@ class IlluminationGrid:
     rows : tuple of IlluminationGrid, optional
         Of a field whose level is held: the same at equal steps of the sweep of the other fields. The arrays of the grid
         itself are those in its middle.
+    held : Held, optional
+        In place of the arrays: nodes in blocks, `spec` being the lattice of the finest. The arrays are then made when
+        they are asked for, with what a lookup answers at nodes that no block holds; `lookup` and its like need none.
 
     Attributes
     ----------
@@ -55,45 +74,105 @@ class IlluminationGrid:
     """
 
     spec: GridSpec
-    values: NDArray[np.float32]
-    error: NDArray[np.float32]
-    support: NDArray[np.float32]
-    channels: Channels = None  # type: ignore[assignment]
-    errors: NDArray[np.float32] | None = None
-    rows: tuple["IlluminationGrid", ...] = ()
-    light: NDArray[np.float32] = field(init=False, repr=False)
+    channels: Channels
+    rows: tuple["IlluminationGrid", ...]
+    held: Held
 
-    def __post_init__(self) -> None:
-        shape = tuple(self.spec.shape)
-        if np.shape(self.values)[:-1] != shape:
-            expected = f"{(*shape, 3)} (RGB), {(*shape, 1)} (grey) or as many channels as are named"
-            raise BadInput(f"the values of a grid have shape {np.shape(self.values)}; expected {expected}")
-        arrays = {name: np.ascontiguousarray(getattr(self, name), dtype=np.float32) for name in ("error", "support")}
-        for name, array in arrays.items():
-            if array.shape != shape:
-                raise BadInput(f"the {name} of a grid has shape {array.shape}; expected {shape}")
-        for name, value in (arrays | stored(self.values, self.channels)).items():
+    def __init__(
+        self, spec: GridSpec, values: ArrayLike | None = None, error: ArrayLike | None = None,
+        support: ArrayLike | None = None, channels: Channels | None = None, errors: NDArray[np.float32] | None = None,
+        rows: tuple["IlluminationGrid", ...] = (), held: Held | None = None,
+    ) -> None:  # fmt: skip
+        if held is None or not (values is None and error is None and support is None):
+            before = None if held is None else IlluminationGrid(spec, channels=channels, held=held)
+            if before is not None:  # as `replace` hands on what is not replaced
+                errors = before.errors if values is None and errors is None else errors
+                values = before.light if values is None else values
+                error = before.error if error is None else error
+                support = before.support if support is None else support
+            held, channels = _dense(spec, values, error, support, channels, errors)
+        if tuple(held.layout.shape) != tuple(spec.shape):
+            raise BadInput(f"blocks of a lattice of shape {tuple(held.layout.shape)} came; expected {spec.shape}")
+        for name, value in (("spec", spec), ("channels", channels), ("rows", rows), ("held", held)):
             object.__setattr__(self, name, value)
-        if self.errors is not None and self.errors.shape != self.light.shape:
-            raise BadInput(f"the errors of a grid have shape {self.errors.shape}; expected {self.light.shape}")
+
+    @cached_property
+    def _arrays(self) -> tuple[NDArray[np.float32], ...]:
+        """Light (nx, ny, nz, C), error and support (nx, ny, nz) of all nodes."""
+        held, shape = self.held, tuple(self.spec.shape)
+        if held.layout.dense:
+            return held.light[0], held.error[0], held.support[0]
+        found = tuple(np.empty((*shape, *more), np.float32) for more in ((held.light.shape[4],), (), ()))
+        for nodes in self._slabs():
+            for whole_of, some in zip(found, self._at(nodes)):
+                whole_of.reshape(-1, *whole_of.shape[3:])[nodes] = some
+        for array in found:
+            array.flags.writeable = False
+        return found
+
+    def _slabs(self) -> Iterator[slice]:
+        count = int(np.prod(self.spec.shape))
+        for first in range(0, count, _BLOCK):
+            yield slice(first, min(first + _BLOCK, count))
+
+    def _at(self, nodes: slice) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+        """Light (m, C), error (m,) and support (m,) of some nodes of the finest lattice."""
+        index = np.stack(np.unravel_index(np.arange(nodes.start, nodes.stop), self.spec.shape), axis=-1)
+        return answer(*self.held[:4], index)
+
+    @property
+    def light(self) -> NDArray[np.float32]:
+        """Irradiance (nx, ny, nz, C) in all channels."""
+        return self._arrays[0]
+
+    @property
+    def error(self) -> NDArray[np.float32]:
+        """Standard error (nx, ny, nz) of all nodes."""
+        return self._arrays[1]
+
+    @property
+    def support(self) -> NDArray[np.float32]:
+        """Samples (nx, ny, nz) behind all nodes."""
+        return self._arrays[2]
+
+    @cached_property
+    def values(self) -> NDArray[np.float32]:
+        """Irradiance (nx, ny, nz, 3), linear RGB; no copy where that is what is stored."""
+        rgb = self.channels.rgb(self.light).view()
+        rgb.flags.writeable = False
+        return rgb
+
+    @cached_property
+    def errors(self) -> NDArray[np.float32] | None:
+        """Standard error (nx, ny, nz, C) of each channel, of several layers."""
+        held = self.held
+        if held.errors is None or held.layout.dense:
+            return None if held.errors is None else held.errors[0]
+        found = np.empty((*self.spec.shape, held.errors.shape[4]), np.float32)
+        own = IlluminationGrid(self.spec, channels=self.channels, held=held._replace(light=held.errors, errors=None))
+        for nodes in self._slabs():
+            found.reshape(-1, found.shape[3])[nodes] = own._at(nodes)[0]
+        return found
 
     def showing(self, channels: Channels) -> "IlluminationGrid":
         """The same grid showing another mix of its layers.
 
         Its error is an upper bound: the sum of each layer's error times the absolute value of its weight.
         """
-        error = np.full(self.error.shape, np.inf, np.float32)
-        if self.errors is not None:
-            known = np.isfinite(self.errors)  # infinite times 0 is no number
-            bound = np.where(known, self.errors, np.float32(0)) @ np.abs(np.array(channels.mix, np.float32))
-            error = np.where(known.all(axis=-1), np.sqrt(np.square(bound).mean(axis=-1)), np.inf)
+        held = self.held
+        error = np.full(held.error.shape, np.inf, np.float32)
+        if held.errors is not None:
+            known = np.isfinite(held.errors)  # infinite times 0 is no number
+            bound = np.where(known, held.errors, np.float32(0)) @ np.abs(np.array(channels.mix, np.float32))
+            error = np.where(known.all(axis=-1), np.sqrt(np.square(bound).mean(axis=-1)), np.inf).astype(np.float32)
         rows = tuple(row.showing(channels) for row in self.rows)
-        return replace(self, values=self.light, channels=channels, error=error, rows=rows)
+        return IlluminationGrid(self.spec, channels=channels, rows=rows, held=held._replace(error=error))
 
     def lookup(self, points: ArrayLike, t: float = 0.5) -> NDArray[np.float32]:
         """Irradiance (n, 3) at world points (n, 3), trilinear between nodes; beyond the border, that of the border.
 
-        Never NaN: coordinates that are not finite read the border.
+        Never NaN: coordinates that are not finite read the border. Where no block of nodes lies, the border of the
+        nearest one is read.
 
         Parameters
         ----------
@@ -107,12 +186,12 @@ class IlluminationGrid:
             share = np.float32(place - below)
             one, other = (row.lookup(points) for row in self.rows[below : below + 2])
             return (1 - share) * one + share * other
-        return np.ascontiguousarray(self.channels.rgb(read_lattice(self.spec, self.light, points)))
+        found = read(self.held.layout, self.spec, self.held.light, points)
+        return np.ascontiguousarray(self.channels.rgb(found))
 
     def covered(self, points: ArrayLike) -> NDArray[np.bool_]:
         """Whether (n,) every node that `lookup` mixes at world points (n, 3) has light of its own."""
-        hole = (self.support == 0)[..., None].astype(np.float32)
-        return np.asarray(read_lattice(self.spec, hole, points)[:, 0] == 0)
+        return np.asarray(self.certainty(points)[1] > 0)
 
     def certainty(self, points: ArrayLike) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Error and support (n,) of the up to eight nodes that `lookup` mixes at world points (n, 3).
@@ -120,22 +199,17 @@ class IlluminationGrid:
         The error is their weighted mean, which holds however the nodes' errors are correlated, and infinite where one
         has none; the support is the smallest.
         """
-        index = world_to_index(self.spec, points)
-        error, support = np.zeros(len(index), np.float32), np.full(len(index), np.inf, np.float32)
-        for corner, share in corners(self.spec, index):
-            node, weight = tuple(corner.T), share.astype(np.float32)
-            mixed = weight > 0
-            error[mixed] += weight[mixed] * self.error[node][mixed]
-            support[mixed] = np.minimum(support, self.support[node])[mixed]
-        return error, support
+        held = self.held
+        return answer(held.layout, held.light[..., :0], held.error, held.support, world_to_index(self.spec, points))[1:]
 
     def blocks(self) -> Iterator[Block]:
         """Yield all nodes, some at a time, in C order."""
-        light = self.light.reshape(-1, len(self.channels))
-        error, support = self.error.reshape(-1), self.support.reshape(-1)
-        for first in range(0, len(light), _BLOCK):
-            nodes = slice(first, min(first + _BLOCK, len(light)))
-            yield Block(nodes, self.channels.rgb(light[nodes]), error[nodes], support[nodes])
+        for nodes in self._slabs():
+            if self.held.layout.dense:
+                light, error, support = (a.reshape(-1, *a.shape[3:])[nodes] for a in self._arrays)
+            else:
+                light, error, support = self._at(nodes)
+            yield Block(nodes, self.channels.rgb(light), error, support)
 
     def dense(self) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
         """Values (nx, ny, nz, 3), error (nx, ny, nz) and support (nx, ny, nz) of all nodes as arrays."""
@@ -143,17 +217,53 @@ class IlluminationGrid:
 
     def onto(self, spec: GridSpec) -> "IlluminationGrid":
         """Grid on another lattice: light as `lookup` reads it, error and support those of the nearest node."""
-        points, last = spec.nodes(), np.array(self.spec.shape) - 1
-        nearest = tuple(np.clip(np.round(world_to_index(self.spec, points)), 0, last).astype(np.int64).T)
-        light = read_lattice(self.spec, self.light, points).reshape(*spec.shape, -1)
-        error, support = (array[nearest].reshape(spec.shape) for array in (self.error, self.support))
-        errors = None if self.errors is None else self.errors[nearest].reshape(light.shape)
-        return IlluminationGrid(spec, light, error, support, self.channels, errors)
+        points, held = spec.nodes(), self.held
+        light = read(held.layout, self.spec, held.light, points).reshape(*spec.shape, -1)
+        nearest = np.clip(np.round(world_to_index(self.spec, points)), 0, np.array(self.spec.shape) - 1)
+        each = held.light[..., :0] if held.errors is None else held.errors
+        errors, error, support = answer(held.layout, each, held.error, held.support, nearest)
+        return IlluminationGrid(
+            spec, light, error.reshape(spec.shape), support.reshape(spec.shape), self.channels,
+            None if held.errors is None else errors.reshape(light.shape),
+        )  # fmt: skip
+
+    @property
+    def dark(self) -> NDArray[np.bool_]:
+        """Which nodes (nx, ny, nz) are held and have no light of their own."""
+        held, shape = self.held, self.spec.shape
+        if held.layout.dense:
+            return np.asarray(held.support[0] == 0)
+        layout, found = held.layout, np.zeros(shape, bool)
+        for number, each in enumerate(held.support):
+            index = layout.place(slice(number, number + 1))[0][each.reshape(-1) == 0]
+            index = index[(index < layout.shape).all(axis=1)]
+            box = np.minimum(index // layout.side, np.array(layout.slot.shape) - 1)
+            found[tuple(index[layout.slot[tuple(box.T)] == number].T)] = True
+        return found
+
+    @cached_property
+    def _even(self) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+        """Light (m, C), error (m,) and support (m,) at places that lie evenly: the nodes of the coarsest blocks."""
+        held, shape = self.held, self.spec.shape
+        layout = held.layout
+        if layout.dense:
+            return held.light.reshape(-1, held.light.shape[4]), held.error.reshape(-1), held.support.reshape(-1)
+        index = layout.place(layout.step == layout.step[0]).reshape(-1, 3)
+        index = index[(index < np.array(shape)).all(axis=1)]
+        flat = np.unique(np.ravel_multi_index(tuple(index.T), shape))
+        return answer(*held[:4], np.stack(np.unravel_index(flat, shape), axis=-1))
 
     @property
     def lit(self) -> NDArray[np.float32]:
-        """Irradiance (m, 3) of the nodes that have light of their own."""
-        return np.concatenate([block.values[block.support > 0] for block in self.blocks()])
+        """Irradiance (m, 3) of the nodes that have light of their own; of the coarsest of several densities alone."""
+        return np.concatenate(list(self.lit_parts()))
+
+    def lit_parts(self) -> Iterator[NDArray[np.float32]]:
+        """Yield `lit`, some at a time."""
+        light, _, support = self._even
+        for first in range(0, len(light), _BLOCK):
+            some = slice(first, first + _BLOCK)
+            yield self.channels.rgb(light[some][support[some] > 0])
 
     @cached_property
     def mean(self) -> float:
@@ -164,25 +274,18 @@ class IlluminationGrid:
     @cached_property
     def relative_error(self) -> float | None:
         """Root mean square standard error of the nodes over their mean irradiance; None where none is known."""
-        known = np.isfinite(self.error) & (self.support > 0)
-        mean = float(self.values[known].mean()) if known.any() else 0.0
-        return float(np.sqrt(np.square(self.error[known], dtype=float).mean())) / mean if mean > 0 else None
+        light, error, support = self._even
+        known = np.isfinite(error) & (support > 0)
+        mean = float(self.channels.rgb(light[known]).mean()) if known.any() else 0.0
+        return float(np.sqrt(np.square(error[known], dtype=float).mean())) / mean if mean > 0 else None
 
     @cached_property
-    def _alone(self) -> NDArray[np.bool_]:
-        """Nodes (nx, ny, nz) that rest on one sample, which no other node has, and holes."""
-        return (self.support <= 1) | ~np.isfinite(self.error)
+    def bars(self) -> NDArray[np.float32]:
+        """Standard error (blocks, i, j, k) of a lookup near each node: see `bar`."""
+        layout, light, error, support, _ = self.held
+        return of_blocks(layout, light, error, support, self.channels)
 
-    def _bend(self, axis: int, step: int) -> Floats:
-        """Mean square over RGB of second differences along an axis, `step` nodes apart, less the noise in them."""
-        light, error = (np.moveaxis(a, axis, 0) for a in (self.channels.shown(self.light), self.error))
-        after, here, before = slice(2 * step, None), slice(step, -step), slice(None, -2 * step)
-        square = np.square(light[after] - 2 * light[here] + light[before], dtype=float).mean(axis=-1)
-        # Infinite at holes. Noise that neighbours share, as they rest on the same samples, cancels in the differences.
-        noise = np.where(np.moveaxis(self._alone, axis, 0), np.square(error, dtype=float), 0.0)
-        return np.moveaxis(square - (noise[after] + 4 * noise[here] + noise[before]), 0, axis)
-
-    @cached_property
+    @property
     def bar(self) -> NDArray[np.float32]:
         """Standard error (nx, ny, nz) of a lookup near each node: noise and interpolation; infinite without support.
 
@@ -191,17 +294,10 @@ class IlluminationGrid:
         Interpolation: between nodes a straight line is off by at most an eighth of the second difference (h²/8 times
         the largest second derivative), which is taken along each axis from the values themselves, less their noise.
         """
-        known = (self.support > 0) & np.isfinite(self.error)
-        if not known.any():
-            return np.full(known.shape, np.inf, np.float32)
-        kept = np.where(self._alone, 8 / 27, 1.0)
-        square = np.where(known, kept * np.square(self.error, where=known, out=np.zeros(known.shape)), np.inf)
-        for axis in range(3):
-            if self.spec.shape[axis] > 2:  # two nodes show no curvature
-                bend = np.nan_to_num(self._bend(axis, 1), neginf=0.0)  # next to a hole only the other axes count
-                edges = [(1, 1) if a == axis else (0, 0) for a in range(3)]
-                square += np.pad(np.maximum(bend, 0.0), edges, mode="edge") / 64
-        return np.sqrt(square).astype(np.float32)
+        if self.held.layout.dense:
+            return np.asarray(self.bars[0])
+        held = self.held._replace(error=self.bars)
+        return IlluminationGrid(self.spec, channels=self.channels, held=held).error
 
     @cached_property
     def resolution(self) -> float:
@@ -209,18 +305,33 @@ class IlluminationGrid:
 
         Near 1 the light changes from node to node without a law, and `bar` is a lower bound. Infinite without bends.
         """
-        near, far = 0.0, 0.0
-        for axis in range(3) if np.isfinite(self.error).any() else ():
-            if self.spec.shape[axis] > 4:
-                bends = (self._bend(axis, step) for step in (1, 2))
-                one, two = (bend[np.isfinite(bend)] for bend in bends)
-                near += float(one.mean()) if one.size else 0.0
-                far += float(two.mean()) if two.size else 0.0
-        return float(np.sqrt(far / near)) if near > 0 and far > 0 else np.inf
+        layout, light, error, support, _ = self.held
+        return resolution(layout, light, error, support, self.channels)
 
     def uncertainty(self, points: ArrayLike) -> NDArray[np.float32]:
         """Standard error (n,) of `lookup` at world points (n, 3); infinite where a node of the cell is a hole."""
-        bar = np.where(np.isfinite(self.bar), self.bar, 0.0).astype(np.float32)
-        hole = (~np.isfinite(self.bar)).astype(np.float32)
-        found = read_lattice(self.spec, np.stack([bar, hole], axis=-1), points)
-        return np.where(found[:, 1] > 0, np.inf, found[:, 0]).astype(np.float32)
+        held = self.held
+        return answer(held.layout, held.light[..., :0], self.bars, held.support, world_to_index(self.spec, points))[1]
+
+
+def _dense(
+    spec: GridSpec, values: Any, error: Any, support: Any, channels: Channels | None,
+    errors: NDArray[np.float32] | None,
+) -> tuple[Held, Channels]:  # fmt: skip
+    """Arrays of all nodes as one block."""
+    shape = tuple(spec.shape)
+    if np.shape(values)[:-1] != shape:
+        expected = f"{(*shape, 3)} (RGB), {(*shape, 1)} (grey) or as many channels as are named"
+        raise BadInput(f"the values of a grid have shape {np.shape(values)}; expected {expected}")
+    arrays = []
+    for name, array in (("error", error), ("support", support)):
+        array = np.ascontiguousarray(array, dtype=np.float32)
+        if array.shape != shape:
+            raise BadInput(f"the {name} of a grid has shape {array.shape}; expected {shape}")
+        arrays.append(array[None])
+    kept = stored(values, channels)
+    light: NDArray[np.float32] = kept["light"]
+    if errors is not None and errors.shape != light.shape:
+        raise BadInput(f"the errors of a grid have shape {errors.shape}; expected {light.shape}")
+    each = None if errors is None else errors[None]
+    return Held(whole(shape), light[None], arrays[0], arrays[1], each), kept["channels"]

@@ -3,21 +3,13 @@
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from illumgrid.constants import ON_A_VOXEL
 from illumgrid.field.volume import Lattice
+from illumgrid.grid.blocks import read, whole
 
 
 def read_lattice(spec: Lattice, values: NDArray[np.float32], points: ArrayLike) -> NDArray[np.float32]:
     """Trilinear `values` (nx, ny, nz, m) at world points (n, 3), clamped to the border: (n, m)."""
-    from illumgrid.grid.trilinear import read
-
-    world = np.ascontiguousarray(points, dtype=float).reshape(-1, 3)
-    result = np.zeros((len(world), values.shape[3]), dtype=np.float32)
-    place = (np.ascontiguousarray(x, dtype=float) for x in (spec.origin, spec.direction, spec.spacing))
-    fixed = np.ascontiguousarray(values, np.float32).view()
-    fixed.flags.writeable = False  # always: else Numba compiles again, for another type
-    read(fixed, *place, ON_A_VOXEL, world, result)
-    return result
+    return read(whole(values.shape[:3]), spec, values[None], points)
 
 
 def fill_holes(spacing: ArrayLike, values: NDArray[np.float32], support: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -29,15 +29,12 @@ def coarser(spec: GridSpec, levels: int) -> GridSpec:
     return GridSpec((nx, ny, nz), spec.origin, spec.spacing * 2**levels, spec.direction)
 
 
-def doubled(values: NDArray[np.float32], least: bool = False) -> NDArray[np.float32]:
-    """Values (nx, ny, nz, ...) at the nodes of the next finer lattice: linear between the nodes, or the `least`."""
+def all_corners(nodes: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Cells (nx - 1, ny - 1, nz - 1) all of whose corners are marked."""
     for axis in range(3):
-        line = np.moveaxis(values, axis, 0)
-        more = np.empty((2 * len(line) - 1, *line.shape[1:]), np.float32)
-        more[::2] = line
-        more[1::2] = np.minimum(line[1:], line[:-1]) if least else 0.5 * (line[1:] + line[:-1])
-        values = np.moveaxis(more, 0, axis)
-    return np.ascontiguousarray(values)
+        line = np.moveaxis(nodes, axis, 0)
+        nodes = np.moveaxis(line[1:] & line[:-1], 0, axis)
+    return nodes
 
 
 def spread(grid: IlluminationGrid) -> NDArray[np.float32]:

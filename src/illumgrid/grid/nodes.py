@@ -107,7 +107,26 @@ class Nodes:
         counts = counts.reshape(shape)
         filled = fill_holes(self.spec.spacing, values.reshape(*shape, -1), counts)
         each = None if errors is None else errors.reshape(filled.shape)
-        return IlluminationGrid(self.spec, filled, bars.reshape(shape), counts, channels, each)  # type: ignore[arg-type]
+        return IlluminationGrid(self.spec, filled, bars.reshape(shape), counts, channels, each)
+
+    def grid_of(
+        self,
+        flat: NDArray[np.integer],
+        light: NDArray[np.float32],
+        error: NDArray[np.float32],
+        support: NDArray[np.float32],
+        channels: Channels,
+        errors: NDArray[np.float32] | None = None,
+    ) -> IlluminationGrid:
+        """Grid of light (m, C), error (m,) and support (m,) at the nodes (m,) with these numbers, the others holes."""
+        every = np.zeros((len(self), light.shape[1]), np.float32)
+        bars, counts = np.full(len(self), np.inf, np.float32), np.zeros(len(self), np.float32)
+        every[flat], bars[flat], counts[flat] = light, error, support
+        each = None
+        if errors is not None:
+            each = np.full(every.shape, np.inf, np.float32)
+            each[flat] = errors
+        return self.grid(every, bars, counts, channels, each)
 
 
 @dataclass(frozen=True, eq=False)

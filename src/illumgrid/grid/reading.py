@@ -76,7 +76,19 @@ def hat(d):
 
 
 @inlined
-def weigh(start, place, shape, u, level, normal, exponents, weights, near):
+def first_from(keys, low, high, least):
+    """The first place from `low` up to `high` where ascending keys are at least so large."""
+    while low < high:
+        middle = (low + high) >> 1
+        if keys[middle] < least:
+            low = middle + 1
+        else:
+            high = middle
+    return low
+
+
+@inlined
+def weigh(start, column, place, shape, u, level, normal, exponents, weights, near):
     """Find the samples around index u and their weights: fills `weights` and `near`, returns how many there are."""
     low0, high0 = max(int(np.ceil(u[0] - 2.5)), 0), min(int(np.floor(u[0] + 2.5)), shape[0] - 1)
     low1, high1 = max(int(np.ceil(u[1] - 2.5)), 0), min(int(np.floor(u[1] + 2.5)), shape[1] - 1)
@@ -84,8 +96,10 @@ def weigh(start, place, shape, u, level, normal, exponents, weights, near):
     count, top = 0, -np.inf
     for a in range(low0, high0 + 1):
         for b in range(low1, high1 + 1):
-            row = (a * shape[1] + b) * shape[2]
-            for i in range(start[row + low2], start[row + high2 + 1]):
+            row = a * shape[1] + b
+            for i in range(first_from(column, start[row], start[row + 1], low2), start[row + 1]):
+                if column[i] > high2:
+                    break
                 x, y, z = place[i, 0] - u[0], place[i, 1] - u[1], place[i, 2] - u[2]
                 if max(abs(x), abs(y), abs(z)) >= REACH or count == MOST:
                     continue
@@ -158,11 +172,14 @@ def fit(place, light, u, count, weights, near, system, right):
 
 
 @jit
-def estimate(start, place, light, variance, shape, u, level, normal, exponents, weights, near, system, right, found):
+def estimate(
+    start, column, place, light, variance, shape, u, level, normal, exponents, weights, near, system, right, found
+):
     """Light at index u of the lit lattice, for a surface of this level and normal, from the samples around it.
 
-    Samples lie in bins, one for each node of the lattice, `start` (nodes + 1,) in order. place (m, 8): index
-    coordinates, level, normal, slope. The weights are those of a joint bilateral filter,
+    Samples lie in the order of the nodes that they are next to: `start` (rows + 1,) is where each row of nodes along
+    the last axis begins, `column` (m,) the node in it. place (m, 8): index coordinates, level, normal, slope. The
+    weights are those of a joint bilateral filter,
 
         w = hat(dx) hat(dy) hat(dz) exp(-(δ/LEVEL)²/2) / |∇h'| exp(-(1 - n·n')/TURN),   δ = |c' - c| / |∇h'|,
 
@@ -174,7 +191,7 @@ def estimate(start, place, light, variance, shape, u, level, normal, exponents, 
     The variance is Σ a² σ² of the samples' noise, a their weights in the fit, and (1 + Σ a²) s², s² being by how much
     more than noise the samples around scatter about the fit: the light at the point does so too.
     """
-    count, channels = weigh(start, place, shape, u, level, normal, exponents, weights, near), light.shape[1]
+    count, channels = weigh(start, column, place, shape, u, level, normal, exponents, weights, near), light.shape[1]
     if count == 0:
         return np.inf, 0.0
     total = fit(place, light, u, count, weights, near, system, right)
@@ -204,12 +221,29 @@ def estimate(start, place, light, variance, shape, u, level, normal, exponents, 
 
 @jit
 def fill(
-    values, spacing, sign, ends, scale, shift, start, place, light, variance, dark, shape, ratio, x, out, error, support
+    values,
+    spacing,
+    sign,
+    ends,
+    scale,
+    shift,
+    start,
+    column,
+    place,
+    light,
+    variance,
+    dark,
+    shape,
+    ratio,
+    x,
+    out,
+    error,
+    support,
 ):
     """Fill light (n, C), error and support (n,) at nodes in voxel coordinates x (n, 3).
 
     A node whose value lies beyond the `ends` of the range reads at the nearest end, where the gradient leads to it. u
-    is x times `ratio`; `dark` marks the nodes of the lit lattice that are holes.
+    is x times `ratio`; `dark` are the flat numbers, in order, of the nodes of the lit lattice that are holes.
     """
     exponents, weights, near = np.empty(MOST), np.empty(MOST), np.empty(MOST, np.int64)
     system, right = np.empty((4, 4)), np.empty((4, light.shape[1] + 1))
@@ -218,8 +252,11 @@ def fill(
         a, b, c = x[i, 0], x[i, 1], x[i, 2]
         node = int(np.round(a * ratio[0])), int(np.round(b * ratio[1])), int(np.round(c * ratio[2]))
         aside = max(abs(a * ratio[0] - node[0]), abs(b * ratio[1] - node[1]), abs(c * ratio[2] - node[2]))
-        if aside < NEAREST and dark[(node[0] * shape[1] + node[1]) * shape[2] + node[2]]:
-            continue
+        if aside < NEAREST:
+            flat = (node[0] * shape[1] + node[1]) * shape[2] + node[2]
+            hole = first_from(dark, 0, len(dark), flat)
+            if hole < len(dark) and dark[hole] == flat:
+                continue
         h, gx, gy, gz = outward(values, a, b, c, sign, spacing)
         level = min(max(h, ends[0]), ends[1])
         for _ in range(4):
@@ -240,7 +277,7 @@ def fill(
         if steep == 0.0:
             continue
         square, count = estimate(
-            start, place, light, variance, shape, (a * ratio[0], b * ratio[1], c * ratio[2]),
+            start, column, place, light, variance, shape, (a * ratio[0], b * ratio[1], c * ratio[2]),
             (level - shift) * scale, (nx, ny, nz), exponents, weights, near, system, right, found,
         )  # fmt: skip
         if count > 0.0:

@@ -23,11 +23,12 @@ _ON_A_NODE = 1e-6  # of a spacing
 class Bins(NamedTuple):
     """Samples of one field sorted by the node of the lit lattice that they are next to."""
 
-    start: NDArray[np.int64]  # (nodes + 1,)
+    start: NDArray[np.int64]  # (rows + 1,) of each row of nodes along z
+    column: NDArray[np.int32]  # (m,) node in the row
     place: NDArray[np.float32]  # (m, 8): see `illumgrid.grid.reading.estimate`
     light: NDArray[np.float32]  # (m, C)
     variance: NDArray[np.float32]  # (m,)
-    dark: NDArray[np.bool_]  # (nodes,) holes of the lit lattice
+    dark: NDArray[np.int64]  # flat numbers of the holes of the lit lattice, in order
 
 
 def bins(samples: Samples, nodes: Nodes) -> Bins:
@@ -36,13 +37,12 @@ def bins(samples: Samples, nodes: Nodes) -> Bins:
 
     spec, volume = nodes.spec, nodes.field.volume
     queries = samples.queries[:]  # computed once, where only numbers of nodes are kept
-    count = int(np.prod(spec.shape))
+    rows, nz = spec.shape[0] * spec.shape[1], spec.shape[2]
     index = world_to_index(spec, queries.point)
     closest = np.clip(np.round(index), 0, np.array(spec.shape) - 1).astype(np.int64)
     flat = np.ravel_multi_index(tuple(closest.T), spec.shape)
     lit = samples.paths > 0
-    dark = np.zeros(count, bool)
-    dark[flat[~lit & (np.abs(index - closest) < _ON_A_NODE).all(axis=1)]] = True
+    dark = np.unique(flat[~lit & (np.abs(index - closest) < _ON_A_NODE).all(axis=1)])
     good = np.flatnonzero(lit)
     good = good[np.lexsort((queries.id[good], flat[good]))]
     slope = np.zeros(len(good))
@@ -54,11 +54,12 @@ def bins(samples: Samples, nodes: Nodes) -> Bins:
             queries.normal[good] @ volume.direction, slope * scale,
         ]
     )  # fmt: skip
-    start = np.zeros(count + 1, np.int64)
-    np.cumsum(np.bincount(flat[good], minlength=count), out=start[1:])
+    start = np.zeros(rows + 1, np.int64)
+    np.cumsum(np.bincount(flat[good] // nz, minlength=rows), out=start[1:])
+    column = (flat[good] % nz).astype(np.int32)
     variance = np.square(samples.error[good], dtype=np.float64)
     light = np.ascontiguousarray(samples.light[good], np.float32)
-    return Bins(start, place.astype(np.float32), light, variance.astype(np.float32), dark)
+    return Bins(start, column, place.astype(np.float32), light, variance.astype(np.float32), dark)
 
 
 def _level_units(nodes: Nodes) -> tuple[float, float]:
@@ -97,14 +98,14 @@ class Bilateral:
     def fill(self, samples: Samples, nodes: Nodes) -> IlluminationGrid:
         """Fill a grid of `density` times the nodes: see `illumgrid.stages.Interpolator`."""
         dense = Nodes(denser(nodes.spec, self.density), nodes.field, nodes.number)
-        light, error, support = read(samples, nodes, dense, reachable(nodes.field, dense.spec))
-        return dense.grid(light, error, support, samples.channels)
+        flat = reachable(nodes.field, dense.spec)
+        return dense.grid_of(flat, *read(samples, nodes, dense, flat), samples.channels)
 
 
 def read(
     samples: Samples, nodes: Nodes, dense: Nodes, flat: NDArray[np.int64]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-    """Light (n, C), error (n,) and support (n,) at all nodes of `dense`; only those with the numbers `flat` are read.
+    """Light (n, C), error (n,) and support (n,) at the nodes (n,) of `dense` with the numbers `flat`.
 
     The samples lie around `nodes`, the lattice that was lit.
     """
@@ -112,24 +113,22 @@ def read(
 
     sorted_ = bins(samples, nodes)
     spec, field = nodes.spec, nodes.field
-    light = np.zeros((len(dense), samples.light.shape[1]), np.float32)
-    error, support = np.full(len(dense), np.inf, np.float32), np.zeros(len(dense), np.float32)
+    light = np.zeros((len(flat), samples.light.shape[1]), np.float32)
+    error, support = np.full(len(flat), np.inf, np.float32), np.zeros(len(flat), np.float32)
     volume, (scale, shift) = field.volume, _level_units(nodes)
     ratio = (np.array(spec.shape) - 1.0) / (np.array(volume.shape) - 1.0)
 
-    def chunk(flat: NDArray[np.int64]) -> None:
-        at = np.stack(np.unravel_index(flat, dense.spec.shape), axis=1) * (dense.spec.spacing / volume.spacing)
-        some = np.zeros((len(flat), light.shape[1]), np.float32)
-        bar, many = np.full(len(flat), np.inf, np.float32), np.zeros(len(flat), np.float32)
+    def chunk(some: slice) -> None:
+        index = np.unravel_index(flat[some], dense.spec.shape)
         fill(
             volume.stored, volume.spacing, field.upward, field.stored_range, scale, shift, *sorted_,
-            np.array(spec.shape), ratio, at, some, bar, many,
+            np.array(spec.shape), ratio, np.stack(index, axis=1) * (dense.spec.spacing / volume.spacing),
+            light[some], error[some], support[some],
         )  # fmt: skip
-        light[flat], error[flat], support[flat] = some, bar, many
 
-    chunk(flat[:0])  # compiles once, in the main thread, which Ctrl-C interrupts
+    chunk(slice(0, 0))  # compiles once, in the main thread, which Ctrl-C interrupts
     with ThreadPoolExecutor(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else None) as pool:
-        list(pool.map(chunk, (flat[i : i + _BLOCK] for i in range(0, len(flat), _BLOCK))))
+        list(pool.map(chunk, (slice(i, i + _BLOCK) for i in range(0, len(flat), _BLOCK))))
     return light, error, support
 
 

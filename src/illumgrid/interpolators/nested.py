@@ -8,7 +8,9 @@ from numpy.typing import NDArray
 
 from illumgrid.errors import BadInput
 from illumgrid.grid import IlluminationGrid, Nodes
-from illumgrid.grid.nested import coarser, doubled
+from illumgrid.grid.blocks import answer, beside_coarser, boxes, in_cells, laid_out, put
+from illumgrid.grid.illumination import Held
+from illumgrid.grid.nested import all_corners, coarser
 from illumgrid.interpolators.bilateral import read
 from illumgrid.interpolators.nearest import Nearest
 from illumgrid.transport.samples import Samples
@@ -38,50 +40,77 @@ class Nested:
             raise BadInput(f"nested.levels is {self.levels}; expected 0 to 4")
 
     def fill(self, samples: Samples, nodes: Nodes) -> IlluminationGrid:
-        """Fill every node; the ids of the samples are those of `direct`: see `illumgrid.stages.Interpolator`."""
+        """Fill blocks of nodes; the ids of the samples are those of `direct`: see `illumgrid.stages.Interpolator`."""
         number = (samples.queries.id & NUMBER).astype(np.int64)
         place = np.stack(np.unravel_index(number, nodes.spec.shape), axis=1)
+        known = Samples(samples.queries[:], samples.light, samples.spread, samples.paths, samples.channels)
         grid: IlluminationGrid | None = None
         for level in range(self.levels, -1, -1):
-            own = Nodes(coarser(nodes.spec, level), nodes.field, nodes.number)
-            at = np.flatnonzero((place % 2**level == 0).all(axis=1))
-            flat = np.ravel_multi_index(tuple((place[at] >> level).T), own.spec.shape)
-            grid = _level(samples[at], own, flat, grid)
+            on = np.flatnonzero((place % 2**level == 0).all(axis=1))
+            grid = _level(known[on], place[on], nodes, level, grid)
         assert grid is not None
         return grid
 
 
-def _level(samples: Samples, nodes: Nodes, flat: NDArray[np.int64], below: IlluminationGrid | None) -> IlluminationGrid:
-    """Grid of one level from the samples at its nodes `flat`, and from the level below."""
-    light, error, support = read(samples, nodes, nodes, flat)
-    errors = None
-    if samples.errors is not None:  # of each channel: they shrink as the whole error does
-        errors = np.full(light.shape, np.inf, np.float32)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            less = np.where(samples.error > 0, error[flat] / samples.error, 1.0)
-            errors[flat] = np.nan_to_num(samples.errors * less[:, None], nan=np.inf, posinf=np.inf)
+def _level(
+    samples: Samples, place: NDArray[np.int64], nodes: Nodes, level: int, below: IlluminationGrid | None
+) -> IlluminationGrid:
+    """Grid of the blocks down to one level, from the samples at its nodes (n, 3) and from the levels below."""
+    own, step = Nodes(coarser(nodes.spec, level), nodes.field, nodes.number), 2**level
     if below is None:
-        rim, there = Nearest().fill(samples, nodes), support == 0  # nodes at the rim, without a point of their own
-        light[there], error[there] = rim.light.reshape(light.shape)[there], rim.error.reshape(-1)[there]
-        support[there] = rim.support.reshape(-1)[there]
-        if errors is not None and rim.errors is not None:
-            errors[there] = rim.errors.reshape(errors.shape)[there]
-        return nodes.grid(light, error, support, samples.channels, errors)
-    own = np.zeros(len(nodes), bool)
-    own[flat] = support[flat] > 0  # a hole shows what is between its neighbours
-    between, low, high = ~own, *nodes.field.range
-    level = samples.queries.level[:, nodes.number]
-    hole = flat[(support[flat] == 0) & (level > low) & (level < high)]
-    light[between] = doubled(below.light).reshape(light.shape)[between]
-    # Between nodes a lookup was as far off as `bar` says; so are nodes that hold what it read.
-    error[between] = doubled(below.bar).reshape(-1)[between]
-    support[between] = doubled(below.support, least=True).reshape(-1)[between]
-    error[hole], support[hole] = np.inf, 0.0
-    if errors is not None and below.errors is not None:
-        errors[between] = doubled(below.errors).reshape(errors.shape)[between]
-        errors[hole] = np.inf
-    shape = nodes.spec.shape
-    each = None if errors is None else errors.reshape(*shape, -1)
-    return IlluminationGrid(
-        nodes.spec, light.reshape(*shape, -1), error.reshape(shape), support.reshape(shape), samples.channels, each
+        return _coarsest(samples, place, nodes, own, step)
+    fresh = (place % (2 * step) != 0).any(axis=1)
+    held = below.held
+    corner = boxes(place[fresh], nodes.spec.shape, step)
+    layout = laid_out(
+        nodes.spec.shape, np.concatenate([held.layout.corner, corner]),
+        np.concatenate([held.layout.step, np.full(len(corner), step)]),
+    )  # fmt: skip
+    mine = np.flatnonzero(_around(fresh, place, nodes, step))
+    mine = mine[~beside_coarser(layout, place[mine], step)]
+    # Other nodes have the light between those below. There a lookup was as far off as `bar` says; so are they.
+    index = layout.place(slice(len(held.layout), None))
+    between = answer(held.layout, held.light, below.bars, held.support, index)
+    light, error, support = (
+        np.concatenate([old, new.reshape(-1, *old.shape[1:])])
+        for old, new in zip((held.light, held.error, held.support), between)
     )
+    found = read(samples, own, own, np.ravel_multi_index(tuple((place[mine] // step).T), own.spec.shape))
+    lit, low, high = found[2] > 0, *nodes.field.range
+    isovalue = samples.queries[mine].level[:, nodes.number]
+    hole = mine[~lit & (isovalue > low) & (isovalue < high)]  # shows what is between its neighbours
+    put(layout, place[mine[lit]], step, (light, error, support), [part[lit] for part in found])
+    put(layout, place[hole], step, (error, support), (np.inf, 0.0))
+    return IlluminationGrid(nodes.spec, channels=samples.channels, held=Held(layout, light, error, support))
+
+
+def _coarsest(samples: Samples, place: NDArray[np.int64], nodes: Nodes, own: Nodes, step: int) -> IlluminationGrid:
+    """Grid of blocks of the coarsest level, where all corners of a cell were asked."""
+    flat = np.ravel_multi_index(tuple((place // step).T), own.spec.shape)
+    light, error, support = read(samples, own, own, flat)
+    dark = support == 0  # at the rim, without a point of their own
+    if dark.any():
+        rim = Nearest().fill(samples, own)
+        for part, array in zip((light, error, support), (rim.light, rim.error, rim.support)):
+            part[dark] = array.reshape(-1, *part.shape[1:])[flat[dark]]
+    whole = own.grid_of(flat, light, error, support, samples.channels)
+    asked = np.zeros(own.spec.shape, bool)
+    asked.reshape(-1)[flat] = True
+    layout = in_cells(nodes.spec.shape, all_corners(asked), step)
+    index = np.minimum(layout.place(slice(None)) // step, np.array(own.spec.shape) - 1)
+    shape, at = (-1, *layout.side + 1), tuple(np.moveaxis(index, -1, 0))
+    light, error, support = (
+        array[at].reshape(*shape, *array.shape[3:]) for array in (whole.light, whole.error, whole.support)
+    )
+    return IlluminationGrid(nodes.spec, channels=samples.channels, held=Held(layout, light, error, support))
+
+
+def _around(fresh: NDArray[np.bool_], place: NDArray[np.int64], nodes: Nodes, step: int) -> NDArray[np.bool_]:
+    """Which nodes (n, 3) are `fresh`, of this level alone, or beside one: those of cells that are halved here."""
+    marked = np.zeros(np.array(nodes.spec.shape) // step + 3, bool)
+    marked[tuple((place[fresh] // step + 1).T)] = True
+    found = fresh.copy()
+    old = np.flatnonzero(~fresh)
+    for toward in np.ndindex(3, 3, 3):
+        found[old] |= marked[tuple((place[old] // step + np.array(toward)).T)]
+    return found

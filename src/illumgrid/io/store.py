@@ -8,6 +8,8 @@
   several lights also each alone, ``key.Y`` (to be multiplied by the light's colour) or ``key.R``, and ``key.Y.error``;
 - ``field/<field name>``: the field's values as they were used, in their type;
 
+where nodes are held in blocks (see `illumgrid.grid.blocks`) another, ``blocks/<field name>``, says where they lie;
+
 and each quad one, ``wall/<quad name>``: light and support of its texels, (nu, nv, rows of the level table).
 
 ``run.json`` says where the arrays lie in the world, how channels of light mix to RGB, and all else. Its ``checksum``
@@ -34,10 +36,12 @@ from illumgrid.field.storing import NATIVE
 from illumgrid.field.volume import Lattice, Volume, histogram
 from illumgrid.grid import RGB, Channels, GridSpec, IlluminationGrid, WallTexture
 from illumgrid.io import disk, exr
+from illumgrid.io import grids as grid_parts
 from illumgrid.io.disk import ELSEWHERE
 from illumgrid.io.elsewhere import Source, digest, fields_again, referred
 
-FORMAT = 3  # 1 had RGB only; to 2, fields were float32 with x fastest, and one checksum covered both files
+FORMAT = 4
+"""1 had RGB only; to 2, fields were float32, x fastest, and one checksum covered both files; to 3, grids were dense."""
 EXR, RUN, PREVIEW, MOMENTS = "illumination.exr", "run.json", "preview.png", "moments.npz"
 PLACE = ("origin", "spacing", "direction")
 BINS = 64  # of the histogram of a field
@@ -266,7 +270,8 @@ def _describe(stored: Stored) -> Record:
         "levels": np.asarray(stored.levels.table, float).tolist(),
         "grids": {
             f.name: lattice(grid.spec)
-            | {"lit": float((grid.support > 0).mean())}
+            | {"lit": _lit(grid)}
+            | ({"blocks": count} if (count := grid_parts.blocks_of(grid)) else {})
             | ({"rows": len(grid.rows)} if grid.rows else {})
             for f, grid in zip(stored.scene.fields, stored.grids)
         },
@@ -274,6 +279,12 @@ def _describe(stored: Stored) -> Record:
         "recipe": stored.recipe,
     }
     return dict(json.loads(json.dumps(record, allow_nan=False)))
+
+
+def _lit(grid: IlluminationGrid) -> float:
+    """Share of the nodes that have light of their own; of the coarsest of several densities."""
+    step = int(grid.held.layout.step[0])
+    return len(grid.lit) / float(np.prod((np.array(grid.spec.shape) - 1) // step + 1))
 
 
 def _described(light: Light) -> Record:
@@ -328,15 +339,11 @@ def _field_volume(record: Record, about: Record, plan: Plan, parts: exr.Parts) -
 def _rebuild(record: Record, plan: Plan, parts: exr.Parts, volumes: list[Volume] | None) -> Stored:
     grids, fields = [], []
     for number, about in enumerate(record["scene"]["fields"]):
-        where, part = record["grids"][about["name"]], f"light/{about['name']}"
-        spec, channels, light = (
-            GridSpec(_shape(where), *(where[k] for k in PLACE)),
-            _channels(record, part),
-            parts.pop(part),
-        )
-        rows = tuple(_grid(spec, channels, parts.pop(part)) for part in _rows(record, about["name"]))
-        grid = _grid(spec, channels, light)
-        grids.append(replace(grid, values=grid.light, rows=rows) if rows else grid)
+        where, channels = record["grids"][about["name"]], _channels(record, f"light/{about['name']}")
+        spec = GridSpec(_shape(where), *(where[k] for k in PLACE))
+        rows = tuple(grid_parts.of_lattice(spec, channels, parts.pop(part)) for part in _rows(record, about["name"]))
+        grid = grid_parts.rebuilt(about["name"], spec, channels, parts, grid_parts.count_of(where))
+        grids.append(replace(grid, rows=rows) if rows else grid)
         volume = _field_volume(record, about, plan, parts) if volumes is None else volumes[number]
         looks = {name: about[name] for name in (*LOOKS, "roughness") if name in about}
         material = Material(about["albedo"], about["emission"], **looks)
@@ -355,12 +362,6 @@ def _rebuild(record: Record, plan: Plan, parts: exr.Parts, volumes: list[Volume]
     lights = tuple(map(_light, record["scene"].get("lights", [])))
     scene = Scene(tuple(fields), tuple(quads), record["scene"]["background"], lights)
     return Stored(scene, Levels(np.array(record["levels"], float)), tuple(grids), tuple(walls), record["recipe"])
-
-
-def _grid(spec: GridSpec, channels: Channels, light: Any) -> IlluminationGrid:
-    values, error, support = (exr.array(light, names, spec.shape) for names in (channels.names, "error", "support"))
-    errors = exr.array(light, tuple(_errors(channels)), spec.shape) if _errors(channels) else None
-    return IlluminationGrid(spec, values, error, support, channels, errors)
 
 
 MOST_ROWS = 64
@@ -397,19 +398,14 @@ def _channels(record: Record, part: str) -> Channels:
     raise BadInput(f"the channels of {part!r} are {str(record['channels'][part])[:80]}; expected names and their mix")
 
 
-def _errors(channels: Channels) -> list[str]:
-    """Names of the channels of a file that hold the errors of lights that are kept apart."""
-    return [f"{name}.error" for name in channels.names] if channels.mixable else []
-
-
 def _plan(record: Record) -> Plan:
     plan: Plan = {}
     for about in record["scene"]["fields"]:
-        part = f"light/{about['name']}"
-        channels = _channels(record, part)
-        names = (*channels.names, *_errors(channels), "error", "support")
-        for one in (part, *_rows(record, about["name"])):
-            plan[one] = exr.Planned(_shape(record["grids"][about["name"]]), names)
+        name, where = about["name"], record["grids"][about["name"]]
+        shape, channels = _shape(where), _channels(record, f"light/{name}")
+        plan |= grid_parts.planned(name, shape, channels, grid_parts.count_of(where))
+        (every,) = grid_parts.planned(name, shape, channels, 0).values()
+        plan |= dict.fromkeys(_rows(record, name), every)
         if "source" not in record:
             plan[f"field/{about['name']}"] = _planned_field(record, about)
     for about in record["scene"]["quads"]:
@@ -427,7 +423,7 @@ def _planned_field(record: Record, about: Record) -> exr.Planned:
 
 
 def _write_exr(path: Path, stored: Stored) -> None:
-    def split(of: IlluminationGrid | WallTexture) -> dict[str, Any]:
+    def split(of: WallTexture) -> dict[str, Any]:
         return {name: of.light[..., c] for c, name in enumerate(of.channels.names)}
 
     def images(arrays: dict[str, Any]) -> tuple[exr.Planned, dict[str, exr.Rows]]:
@@ -436,16 +432,9 @@ def _write_exr(path: Path, stored: Stored) -> None:
 
     parts: dict[str, tuple[exr.Planned, dict[str, exr.Rows]]] = {}
 
-    def of_grid(grid: IlluminationGrid) -> tuple[exr.Planned, dict[str, exr.Rows]]:
-        arrays = split(grid) | {"error": grid.error, "support": grid.support}
-        if names := _errors(grid.channels):
-            errors = np.full(grid.light.shape, np.inf, np.float32) if grid.errors is None else grid.errors
-            arrays |= {name: errors[..., c] for c, name in enumerate(names)}
-        return images(arrays)
-
     for f, grid in zip(stored.scene.fields, stored.grids):
-        parts[f"light/{f.name}"] = of_grid(grid)
-        parts |= {f"rows/{k}/{f.name}": of_grid(row) for k, row in enumerate(grid.rows)}
+        parts |= grid_parts.images(f.name, grid)
+        parts |= {f"rows/{k}/{f.name}": grid_parts.lattice(row) for k, row in enumerate(grid.rows)}
         if stored.source is None:
             parts[f"field/{f.name}"] = exr.of_field(f.volume.stored)
     for quad, wall in zip(stored.scene.quads, stored.walls):

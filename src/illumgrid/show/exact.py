@@ -7,7 +7,7 @@ off enters through two reflections only, averaged over hemispheres, and shadows 
 
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, partial
 from itertools import pairwise
 
@@ -73,7 +73,8 @@ def _mixed(grid: IlluminationGrid, share: float) -> IlluminationGrid:
     place = share * (len(grid.rows) - 1)
     below = min(int(place), len(grid.rows) - 2)
     one, other = (row.light for row in grid.rows[below : below + 2])
-    return replace(grid, values=one + np.float32(place - below) * (other - one), rows=())
+    light = one + np.float32(place - below) * (other - one)
+    return IlluminationGrid(grid.spec, light, grid.error, grid.support, grid.channels)
 
 
 def tracer_of(
