@@ -7,43 +7,37 @@ towards the viewer: the branches could all lie in one plane. Global light casts 
 lies above which.
 """
 
-from dataclasses import replace
-
 import matplotlib.pyplot as plt
-import numpy as np
-from gallery_fields import neuron
-
-import illumgrid as ig
-from illumgrid.show import render
-
-volume, limits, source = neuron()
+from gallery_fields import arms, command, has
 
 # %%
-# A white floor under the neuron, a dim sky, and a lamp above: a quad that shines downwards.
+# One line in a terminal, on a microscopy stack of one neuron (RivuletStudio/rivuletpy, BSD-3 licence): its middle,
+# blurred by about one voxel, on the ground of the studio.
 
-scene = ig.Scene.floor(volume, albedo=(0.8, 0.62, 0.3), range=limits)
-floor = replace(scene.quads[0], texels=(96, 96))
-size = np.abs(floor.edge_u).max()
-corner = floor.corner + 0.2 * floor.edge_u + 0.7 * floor.edge_v + [0, 0, 0.9 * size]
-lamp = ig.Quad(
-    "lamp", corner, 0.2 * floor.edge_v, 0.2 * floor.edge_u, ig.Material((0, 0, 0), (40, 38, 34)), texels=(1, 1)
+FIGURE_1 = (
+    "illumgrid run rivulet_neuron.nrrd --crop 45 195 80 335 0 105 --smooth 1.2 --range 10 40 --scene floor "
+    "--albedo 0.8 0.62 0.3 --grid 128 --no-preview -o neuron && "
+    "illumgrid preview neuron --isovalue 15 --split --view -35,50 -o fig1.png"
 )
-scene = replace(scene, quads=(floor, lamp), background=np.full(3, 0.35))
-light = ig.run(scene, grid=128, paths=32, bounces=2, isovalues=4)
 
 # %%
-# **What to look for:** the left picture does not show how high a branch runs above the floor, or which of two crossing
+# Where that volume is missing, the gallery shows arms that are made of points.
+
+MADE_UP = (
+    "illumgrid density arms.csv -o arms.nrrd --spacing 0.025 --sigma 0.035 && illumgrid run arms.nrrd --scene floor "
+    "--albedo 0.8 0.62 0.3 --grid 64 --no-preview -o neuron && "
+    "illumgrid preview neuron --split --view -35,50 -o fig1.png"
+)
+if not (real := has("rivulet_neuron.nrrd")):
+    arms()
+split = command(FIGURE_1 if real else MADE_UP)
+
+# %%
+# **What to look for:** the left half does not show how high a branch runs above the ground, or which of two crossing
 # branches is nearer. In the right one each branch casts a shadow: the farther the shadow lies from its branch and the
-# softer it is, the higher the branch; where both meet, the branch touches the floor. Bundled branches dim each other.
+# softer it is, the higher the branch; where both meet, the branch touches the ground. Bundled branches dim each other.
 
-level = limits[0] + (limits[1] - limits[0]) / 6
-figure, axes = plt.subplots(1, 2, figsize=(10, 4.6), facecolor="0.235", layout="constrained")
-for ax, local in zip(axes, (True, False)):
-    ax.imshow(render(light, isovalue=level, width=600, height=560, local=local, view=(-35, 50)))
-    ax.set_title("local light" if local else "global light", color="white")
-    ax.set_axis_off()
+figure, ax = plt.subplots(figsize=(10.5, 4), facecolor="0.235", layout="constrained")
+ax.imshow(split)
+ax.set_axis_off()
 plt.show()
-
-# %%
-
-print("Data:", source)
