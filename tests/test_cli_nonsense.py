@@ -227,6 +227,7 @@ def outcome(finished, capsys, monkeypatch):
     """Exit code, output and new files of a command; the new files are removed again."""
     small = {**preview.render.__kwdefaults__, "width": 24, "height": 18}
     monkeypatch.setattr(preview.render, "__kwdefaults__", small)
+    monkeypatch.setattr(preview.strip, "__kwdefaults__", {**preview.strip.__kwdefaults__, "width": 24, "height": 18})
     monkeypatch.setattr(chain, "judged", lambda light, *about: light)
     monkeypatch.chdir(finished)
 

@@ -2,6 +2,7 @@
 
 import math
 
+import numba
 import numpy as np
 import pytest
 
@@ -251,6 +252,16 @@ def test_a_path_that_starts_inside_another_solid_is_worth_nothing():
         scenery = marchable(scene), NO_CACHE, constants.OFF_SWEEP
         kernels.walk(*scenery, key, np.uint64(path), 4, *start, 0, np.ones(3), light)
         assert not light.any()
+
+
+@pytest.mark.skipif(not numba.config.DISABLE_JIT, reason="each kind would be compiled: bytes are, in test_native")
+@pytest.mark.parametrize("kind, least, step", [("i1", -120, 2), ("<i2", -30000, 600), ("<u2", 2, 600)])
+def test_every_kind_of_number_is_read_as_in_single_precision(kind, least, step):
+    values, found = noise(100).values.astype(int) * step + least, []
+    for some in (values.astype(kind), values.astype(np.float32)):
+        scene = Scene.sky(Volume(some), range=(20 * step + least, 80 * step + least))
+        found.append(SOLO.solve(scene, on_sets(scene, 2, 6), paths=range(2), bounces=2, seed=0).light)
+    assert np.array_equal(*found) and found[0].any()
 
 
 @pytest.mark.parametrize("d", [(1, 1, 1), (-1, 1, -1), (0, 0, 1), (0, -1, 0)])
