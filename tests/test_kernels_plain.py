@@ -8,7 +8,7 @@ import pytest
 
 import naive
 from illumgrid import constants
-from illumgrid.backends import kernels, march
+from illumgrid.backends import cubics, kernels, march, normals
 from illumgrid.backends.numba_ import Numba
 from illumgrid.backends.reference import Reference
 from illumgrid.field.levelset import marchable, turned_levels
@@ -53,7 +53,7 @@ def test_the_first_root_of_a_cubic_is_that_of_numpy():
         expected, close = first_of(q, end)
         if close:
             continue
-        t = march.first_root(*q, end)
+        t = cubics.first_root(*q, end)
         assert t == pytest.approx(expected, abs=1e-9, rel=1e-9)
         found += expected < math.inf
         checked += 1
@@ -70,7 +70,7 @@ def test_the_first_root_of_what_is_no_cubic():
         ((-0.24, 1, -1, 0), 1, 0.4),
         ((-2, 3, -1, 0), 3, 1),
     ):
-        t = march.first_root(*(np.float64(c) for c in q), np.float64(end))
+        t = cubics.first_root(*(np.float64(c) for c in q), np.float64(end))
         assert t == pytest.approx(expected, abs=1e-13)
 
 
@@ -83,7 +83,7 @@ def test_a_near_tangent_ray_hits_or_misses_as_the_sign_at_the_top_says(gap):
         falling = np.polynomial.Polynomial([-top, 1]) ** 2 * np.polynomial.Polynomial([slope - bend * top, bend])
         for sign in (1, -1):
             q = (np.polynomial.Polynomial([sign * gap**2]) - falling).coef
-            t = march.first_root(*q, np.float64(1))
+            t = cubics.first_root(*q, np.float64(1))
             if gap**2 < 1e-15:  # lost in rounding: either answer, but at the right place
                 assert t == math.inf or t == pytest.approx(top, abs=1e-6)
             elif sign > 0:
@@ -101,7 +101,7 @@ def test_the_next_root_is_the_first_of_the_quadratic_that_is_left():
         end = rng.uniform(0.2, 3)
         expected, close = first_of(q, end)
         if not close:
-            assert march.next_root(*q, end) == pytest.approx(expected, abs=1e-9, rel=1e-9)
+            assert cubics.next_root(*q, end) == pytest.approx(expected, abs=1e-9, rel=1e-9)
             found += expected < math.inf
             checked += 1
     assert min(checked, 8 * found) > 2000
@@ -121,7 +121,7 @@ def test_the_next_root_of_what_is_no_cubic():
         ((-1, 2.1, -1), 0.72984378812835),
         ((-1, 1.9, -1), math.inf),
     ):
-        t = march.next_root(*(np.float64(c) for c in q), np.float64(1))
+        t = cubics.next_root(*(np.float64(c) for c in q), np.float64(1))
         assert t == pytest.approx(expected, abs=1e-12)
 
 
@@ -150,7 +150,7 @@ def test_normals_and_solids_are_those_of_the_volume(inside):
     level = turned_levels(scene, np.array([4.5]))[0]
     solid = scene.fields[0].upward * (interpolate(volume, index) - 4.5) >= 0
     for u, normal, within in zip(index, expected, solid):
-        np.testing.assert_allclose(march.gradient_normal(fields, 0, *u), normal, atol=1e-6)
+        np.testing.assert_allclose(normals.gradient_normal(fields, 0, *u), normal, atol=1e-6)
         assert march.in_solid(fields, 0, level, tuple(u * volume.spacing), tuple(normal)) == within
     assert (~expected.any(axis=1)).any()
     assert not any(

@@ -14,11 +14,11 @@ import numpy as np
 from numba import cuda
 
 from illumgrid import rng
-from illumgrid.backends import gathering, kernels, lights, march
+from illumgrid.backends import cubics, gathering, kernels, lights, march, normals
 from illumgrid.field.levelset import Marchable
 from illumgrid_cuda import ranks
 
-MODULES = (rng, ranks, march, lights, gathering, kernels)
+MODULES = (rng, ranks, cubics, march, normals, lights, gathering, kernels)
 """In the order in which one uses another."""
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from numba.extending import register_jitable
 
 from illumgrid import constants
-from illumgrid.backends import gathering, lights, march, simd, surfaces
+from illumgrid.backends import cubics, gathering, lights, march, normals, simd, surfaces
 from illumgrid.backends.gathering import ends_in_cache, place_in_sweep
 from illumgrid.backends.lights import (
     cosine_direction,
@@ -32,7 +32,7 @@ from illumgrid.rng import draw, draw_pair, mix, net_size, pascal, reverse, shari
 for _function in (mix, stream, draw, reverse, pascal, upward, draw_pair, net_size, sharing):
     register_jitable(_function)
 
-_SOURCES = gathering, lights, march, simd, surfaces, bvh, mesh_cast, constants
+_SOURCES = gathering, lights, cubics, march, normals, simd, surfaces, bvh, mesh_cast, constants
 jit = cached(*_SOURCES, _nrt=False)  # as in `march`
 inlined = cached(*_SOURCES, _nrt=False, forceinline=True)
 

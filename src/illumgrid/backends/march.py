@@ -8,18 +8,19 @@ arithmetic makes each a double.
 import numpy as np
 
 from illumgrid import constants
-from illumgrid.backends import simd
+from illumgrid.backends import cubics, simd
+from illumgrid.backends.cubics import cubic, root_in_cell
 from illumgrid.backends.simd import address, at_least, cached, count_below
-from illumgrid.backends.surfaces import begin, inside, meet_solid, solid_normal
+from illumgrid.backends.surfaces import begin, inside, meet_solid
 from illumgrid.constants import BRICK_SHIFT, BURIED, CAP, MISS, NOWHERE, ON_A_VOXEL, REACH, SURFACE
 from illumgrid.field.levelset import Marchable
 
 # No fastmath: a miss is t = inf, and the sign of a coefficient near zero decides the side.
 # Nor Numba's reference counts: nothing is allocated here, the caller keeps the arrays alive, and the atomic counts of a
 # scene handed from function to function cost a third of the time.
-jit = cached(simd, constants, _nrt=False)
+jit = cached(cubics, simd, constants, _nrt=False)
 # A call that hands a scene on moves 200 words: what every ray calls is inlined.
-inlined = cached(simd, constants, _nrt=False, forceinline=True)
+inlined = cached(cubics, simd, constants, _nrt=False, forceinline=True)
 
 ONE = np.uint64(1)
 
@@ -55,102 +56,6 @@ def snap(u):
     """Index coordinate of a node that lies on a voxel."""
     nearest = np.round(u)
     return nearest if abs(u - nearest) < ON_A_VOXEL else u
-
-
-@inlined
-def first_root(q0, q1, q2, q3, end):
-    """Smallest t in [0, end] at which q0 + q1 t + q2 t² + q3 t³ reaches 0 from q0 < 0; inf if none."""
-    # On [0, 1]: the Bernstein coefficients bound the cubic, and most cells end here.
-    a, b, c = q1 * end, q2 * end * end, q3 * end * end * end
-    if 3.0 * q0 + a < 0.0 and 3.0 * q0 + 2.0 * a + b < 0.0 and q0 + a + b + c < 0.0:
-        return np.inf
-    # The roots of the derivative part [0, 1] into monotone pieces.
-    low, high = 2.0, 2.0
-    half = b * b - 3.0 * a * c
-    if half > 0.0:
-        q = -(b + np.copysign(np.sqrt(half), b))
-        low, high = q / (3.0 * c), a / q
-        if low > high:
-            low, high = high, low
-    left, below = 0.0, q0
-    for piece in range(3):
-        right = low if piece == 0 else (high if piece == 1 else 1.0)
-        if piece < 2 and not (left < right < 1.0):
-            continue
-        above = q0 + right * (a + right * (b + right * c))
-        if above >= 0.0:
-            # One root in [left, right], on a rising piece: Newton steps from the chord, bisection where they leave the
-            # bracket. A step of 1e-10 leaves an error of its square; at a double root it halves the error.
-            s = left - below * (right - left) / (above - below)
-            for _ in range(60):
-                value = q0 + s * (a + s * (b + s * c))
-                if value >= 0.0:
-                    right = s
-                else:
-                    left = s
-                after = s - value / (a + s * (2.0 * b + 3.0 * c * s))
-                if not (left <= after <= right):
-                    after = 0.5 * (left + right)
-                step, s = abs(after - s), after
-                if step < 1e-10:
-                    break
-            return s * end
-        left, below = right, above
-    return np.inf
-
-
-@inlined
-def next_root(q1, q2, q3, end):
-    """Smallest t in [0, end] at which t (q1 + q2 t + q3 t²) reaches 0 from below, its root at 0 divided out.
-
-    A ray that starts on the level set: 0 if it dips under the surface at once, inf if it does not come back.
-    """
-    a, b, c = q1 * end, q2 * end * end, q3 * end * end * end
-    if a == 0.0:
-        if b > 0.0 or (b == 0.0 and c >= 0.0):  # all zero: the cell is flat, at the level, hence solid
-            return 0.0
-        return -b / c * end if c > 0.0 and -b <= c else np.inf
-    if a > 0.0:
-        return 0.0
-    if a + 0.5 * b < 0.0 and a + b + c < 0.0:
-        return np.inf
-    disc = b * b - 4.0 * a * c
-    if disc < 0.0:
-        return np.inf
-    q = -0.5 * (b + np.copysign(np.sqrt(disc), b))
-    one, other = q / c, a / q
-    best = np.inf
-    if 0.0 < one <= 1.0:
-        best = one
-    if 0.0 < other <= 1.0 and other < best:
-        best = other
-    return best * end
-
-
-@inlined
-def cubic(values, sign, corner, step_x, step_y, level, ex, ey, ez, dx, dy, dz):
-    """Coefficients of sign v - level along a ray through a trilinear cell, from its entry e in [0, 1]³.
-
-    `corner` is the flat number of the cell's first voxel. Parker et al., "Interactive ray tracing for isosurface
-    rendering", IEEE Visualization 1998, with the interpolation nested so that equal values cancel exactly.
-    """
-    f000 = sign * values[corner] - level
-    f001 = sign * values[corner + 1] - level
-    f010 = sign * values[corner + step_y] - level
-    f011 = sign * values[corner + step_y + 1] - level
-    corner += step_x
-    x00, x01 = sign * values[corner] - level - f000, sign * values[corner + 1] - level - f001
-    x10, x11 = sign * values[corner + step_y] - level - f010, sign * values[corner + step_y + 1] - level - f011
-    # Along x: four edges, linear in t.
-    a00, a01, a10, a11 = f000 + x00 * ex, f001 + x01 * ex, f010 + x10 * ex, f011 + x11 * ex
-    s00, s01, s10, s11 = x00 * dx, x01 * dx, x10 * dx, x11 * dx
-    # Along y: two faces, quadratic.
-    y0, y1, r0, r1 = a10 - a00, a11 - a01, s10 - s00, s11 - s01
-    b0, b1, b2 = a00 + y0 * ey, s00 + r0 * ey + y0 * dy, r0 * dy
-    c0, c1, c2 = a01 + y1 * ey, s01 + r1 * ey + y1 * dy, r1 * dy
-    # Along z: the cell, cubic.
-    z0, z1, z2 = c0 - b0, c1 - b1, c2 - b2
-    return b0 + z0 * ez, b1 + z1 * ez + z0 * dz, b2 + z2 * ez + z1 * dz, z2 * dz
 
 
 @inlined
@@ -225,17 +130,6 @@ def cells_to_ask(bricks, brick, rank, c, end, fine):
 def bit_of(c, fine):
     """Number of the bit that stands for a cell in its brick: a cell of its own, or one for 2³ cells if `fine` is 1."""
     return ((c[0] >> fine & 3) << 4) | ((c[1] >> fine & 3) << 2) | (c[2] >> fine & 3)
-
-
-@inlined
-def root_in_cell(values, sign, corner, step_x, step_y, level, ex, ey, ez, dx, dy, dz, on_surface, length):
-    """Distance to the solid within a cell, from the entry e on; inf if it is not met within `length`."""
-    q0, q1, q2, q3 = cubic(values, sign, corner, step_x, step_y, level, ex, ey, ez, dx, dy, dz)
-    if on_surface:
-        return next_root(q1, q2, q3, length)
-    if q0 >= 0.0:
-        return 0.0
-    return first_root(q0, q1, q2, q3, length)
 
 
 @inlined
@@ -431,79 +325,6 @@ def march_from(scene, f, level, x, n, d, own, face, limit):
 
 
 @jit
-def outward(gx, gy, gz):
-    """Unit vector against the gradient of v; 0 on a plateau. Scaled first: the square of a tiny slope underflows."""
-    largest = max(abs(gx), abs(gy), abs(gz))
-    if largest == 0.0:
-        return 0.0, 0.0, 0.0
-    gx, gy, gz = gx / largest, gy / largest, gz / largest
-    length = np.sqrt(gx * gx + gy * gy + gz * gz)
-    return -gx / length, -gy / length, -gz / length
-
-
-@jit
-def cell_normal(scene, f, ux, uy, uz):
-    """Outward normal at index u of the trilinear cell of field f that holds it."""
-    last_x, last_y, last_z = scene.shape[f, 0] - 1, scene.shape[f, 1] - 1, scene.shape[f, 2] - 1
-    cx, cy = follow(ux, 0.0, 0.0, 0, last_x - 1), follow(uy, 0.0, 0.0, 0, last_y - 1)
-    cz = follow(uz, 0.0, 0.0, 0, last_z - 1)
-    wx, wy, wz = min(max(ux - cx, 0.0), 1.0), min(max(uy - cy, 0.0), 1.0), min(max(uz - cz, 0.0), 1.0)
-    step_y = scene.shape[f, 2]
-    step_x = step_y * scene.shape[f, 1]
-    here = scene.start[f] + cx * step_x + cy * step_y + cz
-    _, gx, _, _ = cubic(scene.values, scene.sign[f], here, step_x, step_y, 0.0, wx, wy, wz, 1.0, 0.0, 0.0)
-    _, gy, _, _ = cubic(scene.values, scene.sign[f], here, step_x, step_y, 0.0, wx, wy, wz, 0.0, 1.0, 0.0)
-    _, gz, _, _ = cubic(scene.values, scene.sign[f], here, step_x, step_y, 0.0, wx, wy, wz, 0.0, 0.0, 1.0)
-    return outward(gx / scene.spacing[f, 0], gy / scene.spacing[f, 1], gz / scene.spacing[f, 2])
-
-
-@jit
-def gradient_normal(scene, f, ux, uy, uz):
-    """Outward normal at index u of field f: central differences (one-sided at the border), interpolated trilinearly.
-
-    Where they cancel, that of the trilinear cell.
-    """
-    last_x, last_y, last_z = scene.shape[f, 0] - 1, scene.shape[f, 1] - 1, scene.shape[f, 2] - 1
-    cx, cy = follow(ux, 0.0, 0.0, 0, last_x - 1), follow(uy, 0.0, 0.0, 0, last_y - 1)
-    cz = follow(uz, 0.0, 0.0, 0, last_z - 1)
-    wx, wy, wz = min(max(ux - cx, 0.0), 1.0), min(max(uy - cy, 0.0), 1.0), min(max(uz - cz, 0.0), 1.0)
-    step_y = scene.shape[f, 2]
-    step_x = step_y * scene.shape[f, 1]
-    v, start = scene.values, scene.start[f]
-    gx, gy, gz = 0.0, 0.0, 0.0
-    for corner in range(8):
-        i, j, k = corner >> 2, (corner >> 1) & 1, corner & 1
-        weight = (wx if i else 1.0 - wx) * (wy if j else 1.0 - wy) * (wz if k else 1.0 - wz)
-        here = start + (cx + i) * step_x + (cy + j) * step_y + cz + k
-        after, before = int(cx + i < last_x), int(cx + i > 0)
-        gx += weight * (np.float64(v[here + after * step_x]) - v[here - before * step_x]) / (after + before)
-        after, before = int(cy + j < last_y), int(cy + j > 0)
-        gy += weight * (np.float64(v[here + after * step_y]) - v[here - before * step_y]) / (after + before)
-        after, before = int(cz + k < last_z), int(cz + k > 0)
-        gz += weight * (np.float64(v[here + after]) - v[here - before]) / (after + before)
-    if gx == 0.0 and gy == 0.0 and gz == 0.0:
-        return cell_normal(scene, f, ux, uy, uz)
-    sign = scene.sign[f]
-    gx, gy, gz = sign * gx + 0.0, sign * gy + 0.0, sign * gz + 0.0  # no -0, whose sign would turn a frame of axes
-    return outward(gx / scene.spacing[f, 0], gy / scene.spacing[f, 1], gz / scene.spacing[f, 2])
-
-
-@jit
-def normal_by_field(scene, f, what, face, x, d):
-    """Normal where a ray along d met the trilinear solid of field f at x: the gradient normal, or that of the cap."""
-    if what == CAP:
-        return (
-            -np.copysign(1.0, d[0]) if face == 0 else 0.0,
-            -np.copysign(1.0, d[1]) if face == 1 else 0.0,
-            -np.copysign(1.0, d[2]) if face == 2 else 0.0,
-        )
-    ux = (x[0] - scene.origin[f, 0]) / scene.spacing[f, 0]
-    uy = (x[1] - scene.origin[f, 1]) / scene.spacing[f, 1]
-    uz = (x[2] - scene.origin[f, 2]) / scene.spacing[f, 2]
-    return gradient_normal(scene, f, ux, uy, uz)
-
-
-@jit
 def in_solid(scene, f, level, x, n):
     """Whether the frame point x lies in the trilinear solid {v >= level} of field f, its border included."""
     ux = snap((x[0] - scene.origin[f, 0]) / scene.spacing[f, 0])
@@ -528,7 +349,6 @@ def stay(scene, own, x, n):
 
 for _question, _answer in (
     (meet_solid, march_from),
-    (solid_normal, normal_by_field),
     (inside, in_solid),
     (begin, stay),
 ):

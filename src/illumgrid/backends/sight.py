@@ -6,7 +6,7 @@ Light paths know nothing of coats. As `kernels`, these are serial, and depend on
 import numpy as np
 
 from illumgrid import constants
-from illumgrid.backends import gathering, kernels, lights, march, simd, surfaces
+from illumgrid.backends import cubics, gathering, kernels, lights, march, normals, simd, surfaces
 from illumgrid.backends.gathering import gather_cached
 from illumgrid.backends.kernels import hit_beyond, hit_normal, lets_through
 from illumgrid.backends.lights import (
@@ -27,7 +27,7 @@ from illumgrid.backends.simd import cached
 from illumgrid.constants import BURIED, CAP, MISS, MOST_FILMS, NOWHERE, QUAD, SURFACE
 from illumgrid.rng import draw, draw_pair, stream
 
-_SOURCES = kernels, gathering, lights, march, simd, surfaces, bvh, mesh_cast, constants
+_SOURCES = kernels, gathering, lights, cubics, march, normals, simd, surfaces, bvh, mesh_cast, constants
 jit = cached(*_SOURCES, _nrt=False)  # as in `march`
 
 AT_NORMAL = 0.04
