@@ -200,6 +200,14 @@ def test_a_stop_during_the_imports_has_no_traceback(tmp_path, stop):
     assert (done.returncode, done.stderr) == (130, "illumgrid: stopped; nothing was written\n")
 
 
+def test_a_stop_before_the_command_begins_has_no_traceback(tmp_path):
+    (tmp_path / "early.py").write_text(
+        "from illumgrid import __main__, cli\ndef stop(_):\n    raise KeyboardInterrupt\ncli.listen = stop\n__main__.main()\n"
+    )
+    done = subprocess.run([sys.executable, "early.py"], capture_output=True, text=True, cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (130, "illumgrid: stopped; nothing was written\n")
+
+
 def test_a_stop_after_the_rename_says_what_stands(tmp_path, capsys):
     def stopped_late():
         disk.write_file(tmp_path / "page.html", b"page")
