@@ -57,7 +57,7 @@ CORPUS = Path(__file__).with_name("corpus")
 SECONDS = 10
 """Seconds of the processor: a case that takes more hangs."""
 EXPLAINED = (
-    "past end of allocation|more memory than its numbers explain|too much memory for decoding|needs .* of memory"
+    "past end of allocation|more memory than its numbers explain|too much memory for decoding|needs .* GB.* memory"
 )
 """What is refused before it is taken, and what HDF5 calls the end of a file."""
 ROOM = 1 << 30

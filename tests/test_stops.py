@@ -202,7 +202,9 @@ def test_a_stop_during_the_imports_has_no_traceback(tmp_path, stop):
 
 def test_a_stop_before_the_command_begins_has_no_traceback(tmp_path):
     (tmp_path / "early.py").write_text(
-        "from illumgrid import __main__, cli\ndef stop(_):\n    raise KeyboardInterrupt\ncli.listen = stop\n__main__.main()\n"
+        "from illumgrid import __main__, cli\n"
+        "def stop(_):\n    raise KeyboardInterrupt\n"
+        "cli.listen = stop\n__main__.main()\n"
     )
     done = subprocess.run([sys.executable, "early.py"], capture_output=True, text=True, cwd=tmp_path)
     assert (done.returncode, done.stderr) == (130, "illumgrid: stopped; nothing was written\n")
