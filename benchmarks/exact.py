@@ -4,7 +4,9 @@ The same kernels trace the same visible points of a view that no run has seen. E
 the irradiance over the pixels, against paths of every length from other seeds; half the difference of two such
 references is their own error, whose square is taken off. Seconds are those of all processors, scaled to a picture of
 640 x 480. Also: seconds to a half and a tenth of the lookup's error; FLIP of the pictures against the converged one;
-and what residual paths would bring, which go on where the others end and pay the difference.
+what residual paths would bring, which go on where the others end and pay the difference; and, with many rays in a small
+picture, what is left of the error without noise: the mean product of the errors of two independent pictures, each
+against a reference of its own.
 
     python benchmarks/exact.py [--only NAME] [--out FOLDER]
 """
@@ -26,6 +28,8 @@ from illumgrid.show.picture import _shown
 
 VOLUMES = Path("/data")
 SIZE = 128, 96
+SMALL = 64, 48, 4096
+"""Pixels, and rays from each, at which errors are taken for converged; the reference has four times as many."""
 TRUTH = 512
 FULL = 640 * 480
 
@@ -38,14 +42,14 @@ def scenes(volumes):
     yield "box", lambda: ig.Scene.box(ig.read_volume(volumes / "nucleon.nrrd")), 48
 
 
-def seen(light, exact):
+def seen(light, exact, size=SIZE):
     """What gathers for the view, and its first hits."""
     row = light.scene.levels(0.37)[0]
     shown = _shown(light, None, float(row[0]), False, False, 0.0)
-    camera = fit_camera(light.scene, row, SIZE[0] / SIZE[1], None if light.scene.quads else (215.0, 25.0))
-    made = Gathering(shown, camera, *SIZE, exact)
+    camera = fit_camera(light.scene, row, size[0] / size[1], None if light.scene.quads else (215.0, 25.0))
+    made = Gathering(shown, camera, *size, exact)
     return made, software.first_hits(
-        shown, camera.eye, software.directions_of(camera, SIZE[0], range(SIZE[1]), SIZE[1])
+        shown, camera.eye, software.directions_of(camera, size[0], range(size[1]), size[1])
     )
 
 
@@ -73,6 +77,32 @@ def gathered(light, exact, seed_shift=0):
         spent += time.process_time() - begun
         yield high, spent, by_pixel(hits, pixel, made.blended(hits, pixel, total, count))
         low = high
+
+
+def converged(light):
+    """Relative errors of the lookup, of many rays, and of what is left of these without noise; and their bias."""
+    *size, rays = SMALL
+
+    def found(full, rays, shift):
+        made, hits = seen(light, Exact(rays, full), size)
+        made.__dict__["seed"] = made.seed + shift
+        total, count = np.zeros((len(hits.what), 3), np.float32), np.zeros(len(hits.what), np.int32)
+        pixel = made.gather(hits, 0, [(0, rays)], total, count)
+        alone = Gathering(made.shown, made.camera, *size, Exact(rays, True))  # no lookup in the blend
+        return made, hits, pixel, by_pixel(hits, pixel, alone.blended(hits, pixel, total, count))
+
+    (*_, one), (*_, other) = (found(True, 2 * rays, 2000 + k) for k in range(2))
+    (made, hits, pixel, first), (*_, second) = (found(False, rays, k + 1) for k in range(2))
+    lookup, mean = by_pixel(hits, pixel, looked_up(made.shown, hits)[0]), (one + other).mean() / 2
+
+    def off(this, that):
+        square = ((this - one) * (that - other)).mean()
+        return float(np.sign(square) * np.sqrt(abs(square)) / mean)
+
+    return {
+        "rays": rays, "lookup": off(lookup, lookup), "error": off(first, first), "left": off(first, second),
+        "bias": float((first + second - one - other).mean() / 2 / mean),
+    }  # fmt: skip
 
 
 def measure(name, scene, grid, paths):
@@ -106,6 +136,7 @@ def measure(name, scene, grid, paths):
         row[f"{kind}, seconds to"] = {s: reached(row[kind], s * row["lookup"]["error"][0]) for s in (0.5, 0.1)}
     row["residual"] = residual(made, hits, truth.mean())
     row["FLIP"] = flip(made, row["resting"])
+    row["converged"] = converged(light)
     return row
 
 

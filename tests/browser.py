@@ -143,7 +143,7 @@ class Browser:
         self.page.on("pageerror", lambda error: self.troubles.append(str(error)))
         self.page.on("console", lambda said: self.troubles.append(said.text) if said.type == "error" else None)
 
-    def open(self, light, address="", anew=False, rest=False):
+    def open(self, light, address="", anew=False, rest=False, tint=None):
         """Show a light at an address; a page that shows this light already only gets the address. Pictures of lookups
         are compared while no rays refine them.
         """
@@ -155,7 +155,7 @@ class Browser:
         self.shown = light
         file = self.folder / f"{light.scene.fields[0].name}.html"
         if not file.exists():
-            file.write_text(page(light), encoding="utf-8")
+            file.write_text(page(light, tint=tint), encoding="utf-8")
         self.page.goto("about:blank")
         self.page.goto(f"{file.as_uri()}#{address}")
         return self.settle()

@@ -11,7 +11,7 @@ from illumgrid.errors import BadInput
 from illumgrid.field.scene import Material, Quad, Scene
 from illumgrid.show import fit_camera, render
 from illumgrid.show.engines import software
-from illumgrid.show.exact import FEWEST_TRUST, MOST_TRUST, Exact, Gathering, looked_up, steps_to, tracer_of
+from illumgrid.show.exact import FEWEST_TRUST, MOST_TRUST, Exact, Gathering, cache_at, looked_up, steps_to, tracer_of
 from illumgrid.show.picture import _background, _shown
 from illumgrid.tone import decode_srgb
 from shapes import ball, lit, refused, sky
@@ -114,6 +114,21 @@ def test_rays_converge_to_paths_of_every_length(grey):
         gathered = decode_srgb(render(grey, exact=Exact(paths), **options))
         off.append(np.sqrt(np.square(gathered - truth).mean()))
     assert off[2] < off[1] < off[0] and off[2] < 0.25 * off[0]
+
+
+def test_rays_are_reflected_once_under_a_sky_and_end_at_once_in_a_room(grey):
+    """Surfaces of albedo 0.8 that hold light of 2 bring 1.6 to rays that end there, and 1.28 by one more reflection."""
+    answers = []
+    for value in (0.0, 2.0):
+        room = lit(Scene.box(ball(16), albedo=(0.8, 0.8, 0.8)), value)
+        made = gathering(room, 4)
+        hits = visible(made)
+        rows = hits.lit(0)[::5]
+        asked = made.asked(hits, rows, np.arange(len(rows), dtype=np.uint64))
+        answers.append(tracer_of(room, False)[0](asked, range(64), 0)[0])
+    brought = np.median(answers[1] - answers[0])
+    assert 1.28 < brought <= 1.6
+    assert cache_at(room, 0.5).after == 0 and cache_at(grey, 0.5).after == 1
 
 
 def test_a_picture_watched_ends_as_one_that_is_not(grey):

@@ -11,6 +11,7 @@ from illumgrid.backends.numba_ import Numba
 from illumgrid.backends.reference import Reference
 from illumgrid.errors import BadInput
 from illumgrid.field.layers import layers_of
+from illumgrid.field.levelset import marchable
 from illumgrid.field.lights import Distant, Harmonics, Sky, basis, pixel_directions, projected, rotated
 from illumgrid.field.scene import Material, Quad, Scene
 from illumgrid.field.upright import sky_axes
@@ -299,3 +300,15 @@ def test_damaged_images_of_a_sky_are_refused(content, tmp_path):
         (tmp_path / name).write_bytes(content)
         with pytest.raises(BadInput, match=name):
             read_image(tmp_path / name)
+
+
+def test_a_small_sun_is_asked_for_wherever_interpolation_shows_it():
+    """Bilinear, 0.75² of the light of one pixel comes from the pixel itself, the rest from its eight neighbours."""
+    image = np.zeros((16, 32, 3))
+    image[5, 0] = 1000.0
+    laid = marchable(Scene(Scene.sky(waves()).fields, lights=(Sky("sun", image),)))
+    solid = -np.diff(np.cos(np.linspace(0, np.pi, 17)))[:, None] * 2 * np.pi / 32
+    share = laid.image_density * solid
+    near = share[4:7][:, [31, 0, 1]]
+    assert share.sum() == pytest.approx(1.0)
+    assert near[1, 1] == pytest.approx(0.9 * 0.75**2, rel=0.02) and near.sum() == pytest.approx(0.9, rel=0.02)

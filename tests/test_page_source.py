@@ -30,13 +30,13 @@ LIGHT = coloured(pair())
 # The source
 
 
-def test_the_source_is_under_98_kb():  # 6 of them turn a sky of 25 functions, 17 gather light at rest, 10 show looks
+def test_the_source_is_under_105_kb():  # 6 of them turn a sky of 25 functions, 23 gather light at rest, 10 show looks
     text = page(LIGHT)
     carried = re.findall(
         r'<script type="(?:application/json" id="scene|text/plain" id="data)">(.*?)</script>', text, re.S
     )
     assert len(carried) == 2
-    assert len(text.encode()) - sum(map(len, carried)) < 98_000
+    assert len(text.encode()) - sum(map(len, carried)) < 105_000
 
 
 def test_modules_joined_into_one_keep_their_names_apart():

@@ -199,7 +199,8 @@ def resampled(image: Floats, rows: int, columns: int) -> Floats:
 def _asked_pixels(images: list[Sky], chance: float) -> dict[str, Floats]:
     """Probabilities with which pixels are asked for their light: by brightness and solid angle, images in equal parts.
 
-    A tenth goes evenly to all directions, so that interpolation between pixels never shines where nobody asks.
+    The brightness is the mean over the pixel of what interpolation shows there: half the light of a small sun comes
+    from beyond its pixels. A tenth goes evenly to all directions.
     """
     if not images:
         return {"image_rows": np.zeros(0), "image_columns": np.zeros((0, 0)), "image_density": np.zeros((0, 0))}
@@ -207,7 +208,7 @@ def _asked_pixels(images: list[Sky], chance: float) -> dict[str, Floats]:
     solid = -np.diff(np.cos(np.linspace(0, np.pi, rows + 1)))[:, None] * 2 * np.pi / columns
     share = np.zeros((rows, columns))
     for light in images:
-        bright = resampled(light.radiance, rows, columns).mean(axis=-1) * solid
+        bright = _spread(resampled(light.radiance, rows, columns).mean(axis=-1)) * solid
         share += bright / bright.sum() / len(images)
     share = 0.9 * share + 0.1 * np.broadcast_to(solid, share.shape) / (4 * np.pi)
     row = share.sum(axis=1)
@@ -218,6 +219,13 @@ def _asked_pixels(images: list[Sky], chance: float) -> dict[str, Floats]:
         "image_columns": inner,
         "image_density": np.ascontiguousarray(chance * share / solid),
     }
+
+
+def _spread(image: Floats) -> Floats:
+    """Mean over each pixel (H, W) of the bilinear interpolation of an image, whose azimuth is periodic."""
+    rows = np.pad(image, [(1, 1), (0, 0)], mode="edge")
+    down = 0.75 * image + 0.125 * (rows[:-2] + rows[2:])
+    return np.asarray(0.75 * down + 0.125 * (np.roll(down, 1, axis=1) + np.roll(down, -1, axis=1)))
 
 
 def in_harmonics(scene: Scene, degree: int) -> Scene:

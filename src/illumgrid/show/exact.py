@@ -1,8 +1,9 @@
 """Exact pictures: rays from what a pixel shows gather light, and blend with the lookup by what is known of each.
 
-A gathered ray is reflected once and ends at its second hit, in the light that grids and walls hold there: what they are
-off enters through two reflections only, averaged over hemispheres, and shadows are as sharp as the pixels. See
-`illumgrid.grid.cache`. Rays that end at the first hit cost less, and keep too much of the error: see the docs.
+Under an open sky a gathered ray is reflected once and ends at its second hit, in the light that grids and walls hold
+there: what they are off enters through two reflections only, averaged over hemispheres, and shadows are as sharp as the
+pixels. In a closed room it ends at its first hit: there the second brings more noise than it takes away error, and
+takes as long again. See `illumgrid.grid.cache`, and the docs for figures.
 """
 
 from collections.abc import Callable, Iterator
@@ -62,7 +63,7 @@ class Exact:
 def cache_at(light: Illumination, share: float) -> Cache:
     """The light as a cache for one place in the sweep, 0 to 1: that of held levels is taken there."""
     held = [grid if not grid.rows else _mixed(grid, share) for grid in light.grids]
-    cache = cache_of(light.scene, held, light.walls, after=1)
+    cache = cache_of(light.scene, held, light.walls, after=int(light.scene.open))
     for number, field in enumerate(light.scene.fields):
         if field.isovalue is not None:  # a stretch about its level in which that has the same place
             cache.sweep[number] += np.array([-share, 1.0 - share]) * max(1.0, abs(cache.sweep[number, 0]))

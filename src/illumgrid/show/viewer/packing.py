@@ -297,7 +297,7 @@ def packed(light: Illumination, up: str | None = None, tint: Tint | None = None)
             "colors": [_css(color) for color in _between(trust.SCALE.astype(float))],
         },
         "sky": skies.described(light),
-        "resting": resting.described(light, list(kept_apart(light))),
+        "resting": resting.described(light, list(kept_apart(light)), into),
         "lights": [{"name": name, "weight": weight} for name, weight in kept_apart(light).items()],
         "fields": fields,
         "lead": lead,

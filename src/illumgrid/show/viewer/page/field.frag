@@ -5,6 +5,7 @@ uniform bool uPeel;
 uniform float uRough;                // of the surface's own coat, below 0 without; only rays at rest know how rough
 uniform vec2 uWindow;                // values in steps that a cut shows black and white
 uniform bool uTint;                  // colours of a second quantity
+uniform bool uBase;                  // which alone are drawn
 uniform sampler3D uSecond;
 uniform sampler2D uMap;
 uniform mat4 uToSecond;
@@ -48,6 +49,7 @@ void main() {
   if (what == NOTHING) discard;
   gl_FragDepth = depthOf(t);
   vec3 place = uEye + t * ray;
+  if (uBase && what != SURFACE) { color_ = vec4(0.0); return; }
   if (what == CUT) {                 // the data, as values of sRGB
     vec3 at = (uToIndex * vec4(place, 1.0)).xyz;
     ivec3 cell = clamp(ivec3(at), ivec3(0), textureSize(uField, 0) - 2);
@@ -75,7 +77,9 @@ void main() {
   else color = uGain * uAlbedo * light;
   if (uTint) {
     vec3 base = texture(uMap, vec2(texture(uSecond, (uToSecond * vec4(place, 1.0)).xyz).r * 255.0 / 256.0 + 0.5 / 256.0, 0.5)).rgb;
-    color = base * (local ? facing * uGain * uWhite : dot(curve(uGain * light), vec3(0.2126, 0.7152, 0.0722)));
+    if (uBase) color = base;
+    else if (uRaw) color = uGain * light;
+    else color = base * (local ? facing * uGain * uWhite : dot(curve(uGain * light), vec3(0.2126, 0.7152, 0.0722)));
   }
   if (!uRaw && !cap && (uLook == SHINY || uRough >= 0.0)) color = 0.8 * color + gloss(normal, ray, local ? vec3(uWhite) : light);
   float there = cap ? 1.0 : opaque(facing);

@@ -1,5 +1,5 @@
 // One ray from each pixel's origin: cosine-distributed, or to a light that shadow rays ask for.
-const int OPEN = 0, DISC = 1, LAMP = 2, MIRROR = 3;
+const int OPEN = 0, DISC = 1, LAMP = 2, MIRROR = 3, IMAGE = 4;
 
 uniform sampler2D uPlace, uNormals;  // of origins, see origin.frag
 uniform int uAim;
@@ -9,9 +9,60 @@ uniform float uCosine;               // and the cosine of its half-angle
 uniform vec3 uLamp0, uLampU, uLampV, uLampNormal;
 uniform vec3 uShine;                 // radiance of the disc or the lamp, as the exposure shows it
 uniform vec3 uEyeAt;
+uniform sampler2D uImage;            // of the sky: radiance as the exposure shows it, and the sum up to each pixel of what is asked for
+uniform float uSoft;                 // mean colour up to which escaping rays find a pixel; what is above it is asked for
+uniform vec3 uSkyAxes[3];            // right, back and up
 uniform float uCoats[16];            // roughness of each surface's coat, below 0 without
 
 struct Ray { vec3 start, ahead; float id, reach, worth; };
+
+vec4 pixel(int k, ivec2 size) { return texelFetch(uImage, ivec2(k % size.x, k / size.x), 0); }
+float bright(vec3 light) { return dot(light, vec3(1.0 / 3.0)); }
+float heightOf(float y, ivec2 size) { return 3.14159265 * (0.5 - y / float(size.y)); }
+
+// Light of the image at a place in pixels, bilinear: (what escaping rays find, that times cosine of height, as it is asked for).
+void image(vec2 place, out vec3 soft, out vec3 hard, out float asked) {
+  ivec2 size = textureSize(uImage, 0);
+  vec2 at = vec2(place.x, clamp(place.y, 0.5, float(size.y) - 0.5)) - 0.5, f = fract(at);
+  soft = hard = vec3(0.0);
+  asked = 0.0;
+  for (int k = 0; k < 4; k++) {
+    ivec2 corner = ivec2(floor(at)) + ivec2(k & 1, k >> 1);
+    corner = ivec2((corner.x + size.x) % size.x, min(corner.y, size.y - 1));
+    vec3 light = texelFetch(uImage, corner, 0).rgb;
+    vec2 w = mix(1.0 - f, f, vec2(k & 1, k >> 1));
+    float share = w.x * w.y, kept = min(1.0, uSoft / max(bright(light), 1e-20));
+    soft += share * kept * light;
+    hard += share * (1.0 - kept) * light;
+    asked += share * (1.0 - kept) * bright(light) * cos(heightOf(float(corner.y) + 0.5, size));
+  }
+}
+
+vec2 placeOf(vec3 ray) {
+  vec2 size = vec2(textureSize(uImage, 0));
+  float x = dot(uSkyAxes[0], ray), y = dot(uSkyAxes[1], ray);
+  return size * vec2((x == 0.0 && y == 0.0 ? 0.0 : atan(x, y)) / 6.2831853 + 0.5, acos(clamp(dot(uSkyAxes[2], ray), -1.0, 1.0)) / 3.14159265);
+}
+
+// A direction to what is asked for: a pixel by its brightness, then a place about it, so that the density is bilinear, too.
+void toImage(inout Ray ray, vec3 normal, vec2 u) {
+  ivec2 size = textureSize(uImage, 0);
+  int low = 0, high = size.x * size.y - 1;
+  float total = pixel(high, size).a, wanted = u.x * total;
+  while (low < high) {
+    int middle = (low + high) / 2;
+    if (pixel(middle, size).a <= wanted) low = middle + 1; else high = middle;
+  }
+  float before = low > 0 ? pixel(low - 1, size).a : 0.0;
+  vec2 v = vec2(clamp((wanted - before) / max(pixel(low, size).a - before, 1e-20), 0.0, 1.0), u.y);
+  vec2 place = vec2(low % size.x, low / size.x) + 0.5 + mix(sqrt(2.0 * v) - 1.0, 1.0 - sqrt(max(2.0 - 2.0 * v, 0.0)), step(0.5, v));
+  place.y = float(size.y) - abs(float(size.y) - abs(place.y));
+  float up = heightOf(place.y, size), azimuth = 6.2831853 * (place.x / float(size.x) - 0.5), asked;
+  ray.ahead = cos(up) * (sin(azimuth) * uSkyAxes[0] + cos(azimuth) * uSkyAxes[1]) + sin(up) * uSkyAxes[2];
+  vec3 soft, hard;
+  image(place, soft, hard, asked);
+  ray.worth = max(dot(ray.ahead, normal), 0.0) * cos(up) * 6.2831853 / float(size.x * size.y) * total / max(asked, 1e-20);
+}
 
 // J. Jimenez, "Next generation post processing in Call of Duty", SIGGRAPH 2014: near pixels differ most.
 float noise(vec2 pixel) { return fract(52.9829189 * fract(dot(pixel, vec2(0.06711056, 0.00583715)))); }
@@ -56,6 +107,8 @@ Ray gathered() {
     basisOf(uAxis, a, b);
     ray.ahead = sine * (cos(angle) * a + sin(angle) * b) + cosine * uAxis;
     ray.worth = 2.0 * (1.0 - uCosine) * max(dot(ray.ahead, normal), 0.0);
+  } else if (uAim == IMAGE) {
+    toImage(ray, normal, u);
   } else if (uAim == MIRROR) {
     float rough = ray.id < 0.0 ? -1.0 : uCoats[int(ray.id)];
     ray.worth = 0.0;

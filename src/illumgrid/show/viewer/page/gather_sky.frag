@@ -1,7 +1,8 @@
 // What gathered rays find where nothing stands in their way: the sky, or the light that they were sent to.
 uniform vec4 uDiscs[8];              // axes of discs of the sky and cosines of their half-angles, for coats
 uniform vec3 uDiscShine[8];
-uniform vec3 uSky[25], uSkyAxes[3];  // coefficients as in skies.js; right, back and up
+uniform vec3 uSky[25];               // coefficients as in skies.js
+uniform bool uPictured;              // whether there is an image of the sky
 
 vec3 sky(vec3 ray) {
   float x = dot(uSkyAxes[0], ray), y = dot(uSkyAxes[1], ray), z = dot(uSkyAxes[2], ray), xx = x * x, yy = y * y, zz = z * z;
@@ -20,7 +21,13 @@ void main() {
   Ray ray = gathered();
   if (ray.id < 0.0) discard;
   gl_FragDepth = uAim == LAMP ? depthOf(0.9999 * ray.reach) : 1.0;
-  vec3 light = uAim == OPEN || uAim == MIRROR ? sky(ray.ahead) : uShine;
+  vec3 light = uAim == OPEN || uAim == MIRROR ? sky(ray.ahead) : uAim == IMAGE ? vec3(0.0) : uShine;
+  if (uPictured && uAim != DISC && uAim != LAMP) {
+    vec3 soft, hard;
+    float asked;
+    image(placeOf(ray.ahead), soft, hard, asked);
+    light += uAim == OPEN ? soft : uAim == IMAGE ? hard : soft + hard;
+  }
   if (uAim == MIRROR) for (int k = 0; k < 8; k++) if (dot(uDiscs[k].xyz, ray.ahead) > uDiscs[k].w) light += uDiscShine[k];
   color_ = vec4(ray.worth * light, 1.0);
 }

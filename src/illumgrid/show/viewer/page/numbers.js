@@ -94,6 +94,30 @@ export function capLight({ shown, layers, sky, rest }, weights, turned) {
   return shown.flatMap((color, face) => color.map((known, k) => (known < 0 ? -1 : Math.max(0, mixed(face, k)))));
 }
 
+// Images of the sky, at the weights of their lights, as texels (radiance, sum up to this one of what is asked for), and
+// the mean colour `soft` above which it is: some times that of the whole.
+const BRIGHT = 4;
+export function skyTexels(bytes, [width, height], images) {
+  const texels = new Float32Array(4 * width * height), cosines = Float64Array.from({ length: height }, (_, j) => Math.cos(Math.PI * (0.5 - (j + 0.5) / height)));
+  for (const { offset, share } of images) {
+    const light = words(bytes.subarray(offset, offset + 6 * width * height), 3 * width * height);
+    for (let i = 0; i < width * height; i++) for (let k = 0; k < 3; k++) texels[4 * i + k] += share * HALVES[light[3 * i + k]];
+  }
+  const each = (i) => [(texels[4 * i] + texels[4 * i + 1] + texels[4 * i + 2]) / 3, cosines[Math.floor(i / width)]];
+  let total = 0, weight = 0, sum = 0;
+  for (let i = 0; i < width * height; i++) {
+    const [mean, cosine] = each(i);
+    total += mean * cosine;
+    weight += cosine;
+  }
+  const soft = (BRIGHT * total) / weight;
+  for (let i = 0; i < width * height; i++) {
+    const [mean, cosine] = each(i);
+    texels[4 * i + 3] = sum += Math.max(mean - soft, 0) * cosine;
+  }
+  return { texels, soft, asked: sum > 1e-3 * total };
+}
+
 // Least and largest value over the 5³ voxels of each brick: rays jump over bricks that no level set crosses.
 export function bricks(values, [nx, ny, nz]) {
   const shape = [nx, ny, nz].map((n) => Math.ceil((n - 1) / BRICK));

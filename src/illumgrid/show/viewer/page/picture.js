@@ -164,7 +164,7 @@ export class Picture {
     gl.enable(gl.DEPTH_TEST);
     gl.disable(gl.BLEND);
     const translucent = this.through(state);
-    const empty = translucent ? [0, 0, 0, 0] : [scene.background, scene.background, scene.background, 1];
+    const empty = translucent || seen.uBase ? [0, 0, 0, 0] : [scene.background, scene.background, scene.background, 1];
     gl.clearColor(...empty);
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
     const common = {
@@ -274,12 +274,12 @@ export class Picture {
   }
 
   // Add one sample to the mean of `count` before it, at a place within the pixel; `width` x `height` in all. Into `raw`,
-  // if it is given, goes what the tone curve has not seen.
-  sample(state, width, height, place, count, raw = null) {
+  // if it is given, goes what the tone curve has not seen: light, or if `base` the colours of a second quantity alone.
+  sample(state, width, height, place, count, raw = null, base = false) {
     const gl = this.gl, { scene } = this;
     this.resize(width, height);
     gl.viewport(0, 0, width, height);
-    const seen = { ...this.seen(state, width, height, place), uRaw: raw ? 1 : 0 };
+    const seen = { ...this.seen(state, width, height, place), uRaw: raw ? 1 : 0, uBase: base ? 1 : 0 };
     let drawn = this.layers[0];
     this.layer(drawn, null, seen, state);
     if (this.through(state)) {
@@ -293,7 +293,8 @@ export class Picture {
         this.copy(this.layers[k % 2], this.sum.frame, under);
       }
       gl.bindFramebuffer(gl.FRAMEBUFFER, this.layers[0].frame);
-      gl.clearColor(scene.background, scene.background, scene.background, 1);
+      if (base) gl.clearColor(0, 0, 0, 0);
+      else gl.clearColor(scene.background, scene.background, scene.background, 1);
       gl.clear(gl.COLOR_BUFFER_BIT);
       this.copy(this.layers[0], this.sum.frame, under);
       drawn = this.sum;

@@ -1,7 +1,8 @@
 // While nothing moves, rays from every pixel gather light; see gather.glsl. A ray ends where it meets a surface, in the
 // light that is stored there, so that few suffice; until there are enough, the picture is mostly that of the lookup.
 
-import { dot, eyeOf, facing, sum } from "./camera.js";
+import { dot, sum } from "./camera.js";
+import { skyTexels } from "./numbers.js";
 import { LOOKS, program, set } from "./picture.js";
 import { skyTurned } from "./skies.js";
 
@@ -13,18 +14,18 @@ const FINE = 1 / 500; // standard error, in display radiance, at which the pictu
 const TRIAL = [96, 72], RAYS = 8; // pixels, and rays from each in either half of a trial
 const ENOUGH = 64; // pixels on which a surface is judged by itself
 const BAND = 30; // milliseconds for a part of a slow picture
-const OPEN = 0, DISC = 1, LAMP = 2, MIRROR = 3;
+const OPEN = 0, DISC = 1, LAMP = 2, MIRROR = 3, IMAGE = 4;
 const SHINY = 0.35; // roughness of the shiny look
 
 export class Resting {
   // Null where the page cannot: light that it holds no description of, or a graphics card without single precision.
-  static of(picture, shaders) {
-    return picture.scene.resting && picture.single ? new Resting(picture, shaders) : null;
+  static of(picture, shaders, data) {
+    return picture.scene.resting && picture.single ? new Resting(picture, shaders, data) : null;
   }
 
-  constructor(picture, shaders) {
+  constructor(picture, shaders, data) {
     const { gl } = picture, shared = shaders["shared.glsl"], march = shared + shaders["march.glsl"], ray = shaders["ray.vert"];
-    Object.assign(this, { picture, gl, scene: picture.scene, key: "", size: "" });
+    Object.assign(this, { picture, gl, data, scene: picture.scene, key: "", size: "" });
     this.programs = {
       origin: program(gl, ray, march + shaders["origin.frag"]),
       originWall: program(gl, shaders["wall.vert"], shared + shaders["origin_wall.frag"]),
@@ -54,13 +55,17 @@ export class Resting {
   begin(state, width, height, took) {
     const { picture } = this, size = String([width, height]);
     if (this.size !== size) {
-      if (this.whole) [this.whole.origin, this.whole.ray, this.whole.found, this.whole.mirror, ...this.whole.means, this.raw].forEach((old) => picture.drop(old));
-      Object.assign(this, { size, whole: this.targets(width, height), raw: picture.target(width, height, false), key: "" });
+      if (this.whole) [this.whole.origin, this.whole.ray, this.whole.found, this.whole.mirror, ...this.whole.means, this.raw, this.colors].forEach((old) => picture.drop(old));
+      Object.assign(this, { size, whole: this.targets(width, height), raw: picture.target(width, height, false), colors: picture.target(width, height, false), key: "" });
     }
-    PLACES.slice(0, 4).forEach((place, k) => picture.sample(state, width, height, place, k, this.raw));
-    const key = JSON.stringify([size, state.view, state.sweep, state.weights, state.turn, state.look, state.clip]);
+    const places = PLACES.slice(0, 4);
+    places.forEach((place, k) => picture.sample(state, width, height, place, k, this.raw));
+    this.tinted = this.scene.tint && state.tint;
+    if (this.tinted) places.forEach((place, k) => picture.sample(state, width, height, place, k, this.colors, true));
+    const key = JSON.stringify([size, state.view, state.sweep, state.weights, state.turn, state.look, state.clip, state.tint]);
     if (key === this.key) return;
     this.key = key;
+    this.paint(state);
     this.bands = Array(Math.max(1, Math.min(32, Math.ceil((3 * took) / BAND)))).fill(0);
     this.next = 0;
     this.judge(state);
@@ -103,6 +108,7 @@ export class Resting {
       set(gl, this.programs.show, {
         uStill: picture.bind(0, gl.TEXTURE_2D, picture.mean.color), uLinear: picture.bind(1, gl.TEXTURE_2D, this.raw.color),
         uMean: picture.bind(2, gl.TEXTURE_2D, this.whole.means[rays % 2].color), uCoat: picture.bind(3, gl.TEXTURE_2D, this.whole.means[rays % 2].colors[1]),
+        uColors: picture.bind(4, gl.TEXTURE_2D, this.colors.color), uTint: this.tinted ? 1 : 0,
         uRays: rays, uWhite: this.scene.white, uGain: 2 ** stops, uForward: [0, 0, 1], uRight: [1, 0, 0], uUp: [0, 1, 0],
       });
       gl.drawArrays(gl.TRIANGLES, 0, 3);
@@ -111,7 +117,8 @@ export class Resting {
   }
 
   // What the rays and the lookups of each surface are worth, from rays of their own: weights that depended on the rays
-  // they weigh would darken the picture. Two independent answers tell apart what rays and what lookups are off by.
+  // they weigh would darken the picture. Two independent answers tell apart what rays and what lookups are off by; to the
+  // latter comes its own standard error: little trust where little is known.
   judge(state) {
     const { gl, trial } = this, many = trial.width * trial.height;
     const read = (target, into = new Float32Array(4 * many)) => {
@@ -123,21 +130,25 @@ export class Resting {
       for (let k = 0; k < RAYS; k++) this.gather(trial, state, k, [0.5, 0.5], true, MOST + RAYS * half);
       return read(trial.means[RAYS % 2]);
     });
-    const place = read(trial.origin), sums = [...this.surfaces, null].map(() => [0, 0, 0, 0]);
+    const place = read(trial.origin), sums = [...this.surfaces, null].map(() => [0, 0, 0, 0, 0]);
     for (let i = 0; i < many; i++) {
       const id = place[4 * i + 3];
       if (id < 0) continue;
       for (const total of [sums[id], sums[this.surfaces.length]]) {
+        let product = 0;
         for (let j = 4 * i; j < 4 * i + 3; j++) {
           total[0] += (RAYS * 0.5 * (one[j] - other[j]) ** 2) / 3;
-          total[1] += (one[j] * other[j]) / 3;
+          product += (one[j] * other[j]) / 3;
         }
+        total[1] += product;
+        total[4] += product ** 2;
         total[2] += one[4 * i + 3];
         total[3] += 1;
       }
     }
     const all = sums.pop();
-    const judged = sums.map((own) => (own[3] >= ENOUGH ? own : all)).map(([ray, lookup, usual, n]) => [ray, Math.max(lookup, 0), usual].map((x) => x / Math.max(n, 1)));
+    const judged = sums.map((own) => (own[3] >= ENOUGH ? own : all)).map(([ray, lookup, usual, n, squares]) =>
+      [ray, Math.max(lookup, 0) + Math.sqrt(Math.max(squares - lookup ** 2 / Math.max(n, 1), 0)), usual].map((x) => x / Math.max(n, 1)));
     this.trust = judged.flat();
     this.enough = Math.max(64, Math.min(MOST, Math.ceil(Math.max(...judged.map(([ray]) => ray)) / FINE ** 2)));
   }
@@ -151,6 +162,7 @@ export class Resting {
     for (let k = Math.max(1, discs.length); k < 8; k++) mirror["uDiscs[0]"].push(0, 0, 0, 2);
     return [
       { uAim: OPEN },
+      ...(this.image?.asked ? [{ uAim: IMAGE }] : []),
       ...(this.coats(state).some((rough) => rough >= 0) ? [mirror] : []),
       ...this.scene.resting.discs.map((disc) => ({ uAim: DISC, uAxis: disc.axis, uCosine: disc.cosine, uShine: weighed(disc) })),
       ...this.scene.resting.lamps.map((lamp) => {
@@ -158,6 +170,22 @@ export class Resting {
         return { uAim: LAMP, uLamp0: wall.corner, uLampU: wall.edgeU, uLampV: wall.edgeV, uLampNormal: wall.normal, uShine: weighed(lamp) };
       }),
     ];
+  }
+
+  // The image of the sky at the weights of its lights.
+  paint({ weights }) {
+    const { gl, scene: { resting: { images, size } } } = this;
+    if (!images.length) return;
+    const { texels, soft, asked } = skyTexels(this.data, size, images.map(({ light, offset, exposure }) => ({ offset, share: exposure * (light < 0 ? 1 : weights[light]) })));
+    if (!this.image) {
+      this.image = { texture: gl.createTexture() };
+      gl.bindTexture(gl.TEXTURE_2D, this.image.texture);
+      gl.texStorage2D(gl.TEXTURE_2D, 1, gl.RGBA32F, ...size);
+      for (const name of ["MIN_FILTER", "MAG_FILTER"]) gl.texParameteri(gl.TEXTURE_2D, gl[`TEXTURE_${name}`], gl.NEAREST);
+    }
+    Object.assign(this.image, { soft, asked });
+    gl.bindTexture(gl.TEXTURE_2D, this.image.texture);
+    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, ...size, gl.RGBA, gl.FLOAT, texels);
   }
 
   // Roughness of each surface's coat, -1 without.
@@ -170,7 +198,7 @@ export class Resting {
     const add = (coefficients, share) => coefficients.forEach((c, b) => (total[b] = sum([1, total[b]], [share, c])));
     for (const { light, coefficients } of scene.resting.skies) add(coefficients, light < 0 ? 1 : weights[light]);
     if (scene.sky) add(skyTurned(scene.sky.coefficients, turn), scene.sky.exposure);
-    return { "uSky[0]": total.flat(), "uSkyAxes[0]": scene.resting.axes.flat() };
+    return { "uSky[0]": total.flat(), uPictured: this.image ? 1 : 0 };
   }
 
   // One ray from every pixel at these places within them, into the mean over `count` rays before.
@@ -202,8 +230,8 @@ export class Resting {
     clear(into.found, false, 0);
     const number = first + count, flat = { uForward: [0, 0, 1], uRight: [1, 0, 0], uUp: [0, 1, 0], uJitter: [0, 0] };
     for (const aim of this.aims(state)) {
-      const ray = { ...flat, ...aim, ...coats, uRoll: seen.uRoll, uLook: 0, uTurn: [0.7548776662466927, 0.5698402909980532].map((x) => (0.5 + number * x) % 1) };
-      const origins = () => ({ uPlace: picture.bind(3, gl.TEXTURE_2D, into.origin.colors[0]), uNormals: picture.bind(4, gl.TEXTURE_2D, into.origin.colors[1]) });
+      const ray = { ...flat, ...aim, ...coats, uRoll: seen.uRoll, uLook: 0, "uSkyAxes[0]": scene.resting.axes.flat(), uSoft: this.image?.soft ?? 0, uTurn: [0.7548776662466927, 0.5698402909980532].map((x) => (0.5 + number * x) % 1) };
+      const origins = () => ({ uPlace: picture.bind(3, gl.TEXTURE_2D, into.origin.colors[0]), uNormals: picture.bind(4, gl.TEXTURE_2D, into.origin.colors[1]), uImage: picture.bind(5, gl.TEXTURE_2D, this.image?.texture ?? null) });
       clear(into.ray, true, 0);
       gl.depthFunc(gl.LEQUAL);
       draw(programs.sky, { ...ray, ...this.sky(state), ...origins() });
@@ -220,7 +248,7 @@ export class Resting {
       uOldCoat: bound(5, into.means[count % 2].colors[1]), uMirror: bound(6, into.mirror.color),
       uOld: bound(0, into.means[count % 2].color), uFound: bound(1, into.found.color), uKnown: bound(2, into.origin.colors[2]),
       uPlace: bound(3, into.origin.colors[0]), uNormals: bound(4, into.origin.colors[1]),
-      uShare: 1 / (count + 1), uTrial: isTrial ? 1 : 0, "uTrust[0]": this.trust ?? [0], "uAlbedos[0]": this.surfaces.flatMap((s) => s.albedo),
+      uShare: 1 / (count + 1), uTrial: isTrial ? 1 : 0, "uTrust[0]": this.trust ?? [0], "uAlbedos[0]": this.surfaces.flatMap((s, k) => (this.tinted && k < scene.fields.length ? [1, 1, 1] : s.albedo)),
     });
   }
 }

@@ -18,7 +18,7 @@ const QUICK = 60; // frames faster than this are refined beyond the four samples
 export function view(root, scene, data, shaders, { address = true, onChange = () => {} } = {}) {
   const part = (name) => root.querySelector(`[data-part="${name}"]`);
   const canvas = part("canvas"), stage = part("stage");
-  const picture = new Picture(canvas, scene, data, shaders), resting = Resting.of(picture, shaders);
+  const picture = new Picture(canvas, scene, data, shaders), resting = Resting.of(picture, shaders, data);
   const opened = { ...DEFAULTS, weights: scene.lights.map((light) => light.weight) }, state = { ...opened };
   let changed = -Infinity, samples = 0, coarse = 2, asked = false, written_ = "", fresh = true, rests = false;
 
@@ -128,7 +128,7 @@ export function view(root, scene, data, shaders, { address = true, onChange = ()
   }
 
   function still() {
-    rests = resting && state.rest && state.light === "global" && !state.trust && !(scene.tint && state.tint);
+    rests = resting && state.rest && state.light === "global" && !state.trust;
     part("rays").value = "";
     if (rests) {
       resting.begin(state, canvas.width, canvas.height, view_.took);
