@@ -77,4 +77,4 @@ def smaller(image: Floats, rows: int, columns: int) -> NDArray[np.float64]:
 def _shares(few: Floats, many: Floats) -> Floats:
     """Which share of each part of a line, between these ends, each of finer parts covers: one row for each."""
     common = np.minimum(few[1:, None], many[1:]) - np.maximum(few[:-1, None], many[:-1])
-    return np.maximum(common, 0.0) / np.diff(few)[:, None]
+    return np.asarray(np.maximum(common, 0.0) / np.diff(few)[:, None])
