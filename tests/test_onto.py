@@ -6,7 +6,8 @@ import trimesh
 
 from illumgrid.field.levelset import isosurface
 from illumgrid.field.onto import onto_levels
-from illumgrid.field.volume import index_to_world, interpolate, world_to_index
+from illumgrid.field.scene import Field, Material
+from illumgrid.field.volume import Volume, index_to_world, interpolate, world_to_index
 from illumgrid.io import exports
 from illumgrid.io.readers.mesh import ENDINGS, read_mesh
 from lights import SPACING, lopsided_light
@@ -29,6 +30,17 @@ def test_an_isosurface_baked_is_the_lookup(light):
     assert np.array_equal(lit.visual.vertex_colors[:, :3], light.color(mesh.vertices))
     assert np.array_equal(lit.vertices, mesh.vertices) and np.array_equal(lit.faces, mesh.faces)
     assert not mesh.visual.defined and "light" not in mesh.vertex_attributes  # the given mesh stays as it is
+
+
+def test_an_isosurface_of_noise_written_in_single_precision_lies_on_its_level():
+    """Newton steps would leave, or not arrive, at planes of voxels, where slopes turn over."""
+    noise = np.random.default_rng(0).integers(0, 9, (16, 16, 16)).astype(np.float32)
+    volume = Volume(noise, spacing=(1.1, 0.9, 1.0))
+    written = isosurface(volume, 4.3).vertices.astype(np.float32).astype(float)
+    found = onto_levels(Field("noise", volume, Material((0.8,) * 3), (3.0, 5.0)), written, 4.3)
+    index = world_to_index(volume, written)
+    on_edges = (np.abs(index - np.round(index)) < 1e-4).sum(axis=1) >= 2  # others are middles of cells
+    assert on_edges.mean() > 0.9 and np.abs(found - written)[on_edges].max() < 1e-4
 
 
 def test_shade_is_the_luminance_of_white_and_own_colors_stay():

@@ -7,6 +7,9 @@ from illumgrid.errors import BadInput, shown_range
 from illumgrid.field.scene import Field
 from illumgrid.field.volume import Floats, index_to_world, interpolate, project, world_to_index
 
+SINGLE = 1e-5
+"""Share of a field's span of values by which vertices in single precision may miss the level set of their own mesh."""
+
 
 def onto_levels(field: Field, points: ArrayLike, isovalue: float | None = None) -> Floats:
     """World points (n, 3) moved onto level sets of a field within its range, each by at most a voxel along each axis.
@@ -41,7 +44,9 @@ def onto_levels(field: Field, points: ArrayLike, isovalue: float | None = None) 
     near = np.clip(np.nan_to_num(start), 0.0, top)
     own = interpolate(field.volume, near)
     levels = np.clip(own, low, high) if isovalue is None else np.full(len(world), float(isovalue))
-    moving = levels != own
+    least, most = field.volume.extremes
+    # From nearer, Newton steps may leave rough data, or not end.
+    moving = np.abs(own - levels) > SINGLE * (most - least)
     at, arrived = near.copy(), np.ones(len(world), bool)
     at[moving], arrived[moving] = project(field.volume, near[moving], levels[moving])
     with np.errstate(invalid="ignore"):
