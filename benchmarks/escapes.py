@@ -14,7 +14,8 @@ from itertools import product
 import numpy as np
 
 from illumgrid.accuracy.verify import contenders
-from illumgrid.field.scene import Field, Material, Scene, box_around
+from illumgrid.field.rooms import box_around
+from illumgrid.field.scene import Field, Material, Scene
 from illumgrid.field.volume import Volume
 from illumgrid.stages import on_level_sets
 from illumgrid.transport.samples import Queries, join_queries

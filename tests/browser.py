@@ -12,7 +12,8 @@ from PIL import Image
 
 from illumgrid import show as preview
 from illumgrid.field.layers import layers_of
-from illumgrid.field.scene import Field, Material, Scene, box_around, level_table, upright
+from illumgrid.field.rooms import box_around, upright
+from illumgrid.field.scene import Field, Material, Scene, level_table
 from illumgrid.grid import GridSpec, IlluminationGrid, WallTexture
 from illumgrid.grid.channels import channels_of, mixed
 from illumgrid.light import Illumination

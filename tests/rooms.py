@@ -5,7 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from illumgrid.field.scene import Field, Material, Quad, Scene, box_around
+from illumgrid.field.rooms import box_around
+from illumgrid.field.scene import Field, Material, Quad, Scene
 from illumgrid.field.volume import Volume
 from illumgrid.transport.samples import Queries
 from transport import ALBEDO, EMISSION, SKY, noise, rotation, sidak, waves

@@ -10,7 +10,8 @@ import naive
 from illumgrid.backends.numba_ import Numba
 from illumgrid.backends.reference import Reference
 from illumgrid.bake.walls import wall_queries
-from illumgrid.field.scene import Field, Material, Scene, box_around, level_table
+from illumgrid.field.rooms import box_around
+from illumgrid.field.scene import Field, Material, Scene, level_table
 from illumgrid.field.volume import interpolate, world_to_index
 from illumgrid.transport.samples import join_queries
 from rooms import NOWHERE, ROOMS, at_levels, box, empty, lamps, on_quads, painted

@@ -11,7 +11,8 @@ from illumgrid.backends import kernels
 from illumgrid.backends.numba_ import Numba
 from illumgrid.backends.reference import Reference
 from illumgrid.field.levelset import marchable
-from illumgrid.field.scene import Material, Quad, Scene, box_around
+from illumgrid.field.rooms import box_around
+from illumgrid.field.scene import Material, Quad, Scene
 from illumgrid.transport.samples import join_queries
 from rooms import MIRRORED, NOWHERE, at_levels, box, empty, lamp, lamps, on_quads, painted
 from transport import everywhere, noise, worth

@@ -13,7 +13,8 @@ import pytest
 
 from illumgrid import show as preview
 from illumgrid.errors import BadInput
-from illumgrid.field.scene import Field, Material, Scene, box_around
+from illumgrid.field.rooms import box_around
+from illumgrid.field.scene import Field, Material, Scene
 from illumgrid.show import choose_engine, grid_volume, render
 from illumgrid.show.engines import gl
 from illumgrid.show.shade import BACKGROUND

@@ -10,7 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from illumgrid.backends.numba_ import Numba
-from illumgrid.field.scene import Field, Material, Scene, box_around
+from illumgrid.field.rooms import box_around
+from illumgrid.field.scene import Field, Material, Scene
 from illumgrid.field.volume import Volume, index_to_world
 from illumgrid.transport.samples import Queries
 from transport import assert_standard_normal

@@ -7,7 +7,8 @@ import pytest
 
 import illumgrid as ig
 from illumgrid.field.levelset import marchable
-from illumgrid.field.scene import Field, Material, Quad, Scene, box_around, upright
+from illumgrid.field.rooms import box_around, upright
+from illumgrid.field.scene import Field, Material, Quad, Scene
 from illumgrid.field.volume import Volume, index_to_world
 from shapes import DIRECTIONS, ball, refused
 

@@ -9,7 +9,8 @@ import pytest
 from illumgrid.backends.numba_ import Numba
 from illumgrid.bake.walls import wall_queries
 from illumgrid.field.levelset import isosurface
-from illumgrid.field.scene import Field, Levels, Material, Scene, box_around
+from illumgrid.field.rooms import box_around
+from illumgrid.field.scene import Field, Levels, Material, Scene
 from illumgrid.field.volume import cell_gradient, world_to_index
 from illumgrid.stages import on_level_sets
 from rooms import MIRRORED, NOWHERE, assert_mean, at_levels, empty, lamp, on_quads, painted

@@ -14,7 +14,8 @@ import pytest
 import illumgrid as ig
 from illumgrid import registry
 from illumgrid.errors import IllumgridWarning
-from illumgrid.field.scene import Field, Material, Scene, box_around
+from illumgrid.field.rooms import box_around
+from illumgrid.field.scene import Field, Material, Scene
 from illumgrid.field.volume import Volume
 from illumgrid.grid import Nodes
 from illumgrid.transport.samples import join_queries

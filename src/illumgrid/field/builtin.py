@@ -5,7 +5,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from illumgrid.field.scene import Field, Material, Scene, box_around
+from illumgrid.field.rooms import box_around
+from illumgrid.field.scene import Field, Material, Scene
 from illumgrid.field.volume import Floats, Volume
 
 _VOXELS = 48  # along each axis of the volumes, which span -1 to 1

@@ -8,68 +8,11 @@ from numpy.typing import ArrayLike, NDArray
 from illumgrid.errors import BadInput, shown_range
 from illumgrid.field.boundaries import suggest_range
 from illumgrid.field.lights import Light
-from illumgrid.field.volume import UPWARD, Floats, Side, Volume, finite, index_to_world
-
-
-def _rgb(value: ArrayLike, name: str, at_most: float) -> Floats:
-    color = np.array(value, dtype=float)
-    if color.shape != (3,) or not np.isfinite(color).all() or (color < 0).any() or (color > at_most).any():
-        upper = "up" if at_most == np.inf else f"to {at_most:g}"
-        raise BadInput(
-            f"{name} is {np.asarray(value).tolist()}; expected three numbers (red, green, blue) from 0 {upper}"
-        )
-    color.setflags(write=False)
-    return color
-
-
-@dataclass(frozen=True, eq=False)
-class Material:
-    """A Lambertian surface.
-
-    Parameters
-    ----------
-    albedo : (3,) array_like
-        Fraction of the light that is reflected, linear RGB, 0 to 1.
-    emission : (3,) array_like
-        Emitted radiance, linear RGB.
-    transmission : float
-        Fraction of the light that goes straight through, 0 to 1: the solid of a field is then a thin shell, with light
-        inside. What is neither reflected nor transmitted is absorbed.
-    roughness : float, optional
-        Of a clear coat, from 0, a mirror, to 1. Pictures only: light paths know nothing of coats. None: no coat.
-    translucent : float
-        Share of what lies behind that pictures show through the surface. Pictures only: light does not enter the solid;
-        what `transmission` lets through is seen anyway.
-    """
-
-    albedo: Floats = field(default_factory=lambda: np.full(3, 0.8))
-    emission: Floats = field(default_factory=lambda: np.zeros(3))
-    transmission: float = 0.0
-    roughness: float | None = None
-    translucent: float = 0.0
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "albedo", _rgb(self.albedo, "albedo", 1.0))
-        object.__setattr__(self, "emission", _rgb(self.emission, "emission", np.inf))
-        if not 0.0 <= self.transmission <= 1.0:
-            raise BadInput(f"transmission is {self.transmission}; expected a number from 0 to 1")
-        if self.transmission > 0 and self.albedo.max() + self.transmission > 1.0 + 1e-9:
-            raise BadInput(
-                f"transmission is {self.transmission} and albedo {self.albedo.tolist()}; expected no more than 1 "
-                "together: a surface cannot send on more light than it gets"
-            )
-        if self.transmission > 0 and self.emission.any():
-            raise BadInput("a material with transmission has an emission; expected one of the two: leave one out")
-        if self.roughness is not None and not 0.0 <= self.roughness <= 1.0:
-            raise BadInput(f"roughness is {self.roughness}; expected a number from 0 (a mirror) to 1")
-        if not 0.0 <= self.translucent <= 1.0:
-            raise BadInput(f"translucent is {self.translucent}; expected a number from 0 to 1")
-
-    @property
-    def plain(self) -> bool:
-        """Whether pictures need no rays for it: no coat, and nothing is seen through it."""
-        return self.roughness is None and not (self.transmission or self.translucent)
-
+from illumgrid.field.quads import Material as Material
+from illumgrid.field.quads import Quad as Quad
+from illumgrid.field.quads import rgb
+from illumgrid.field.rooms import box_around, floor_under, square_texels
+from illumgrid.field.volume import UPWARD, Floats, Side, Volume, finite
 
 _HELD = 1e-5
 """Half the width of the range of a level that is held, as a share of the data's: nodes beside it are on it."""
@@ -180,65 +123,6 @@ class Field:
 
 
 @dataclass(frozen=True, eq=False)
-class Quad:
-    """A parallelogram: a wall, a floor, a luminaire.
-
-    It reflects on both sides and emits on its front only: the side of edge_u × edge_v in the world.
-
-    Parameters
-    ----------
-    name : str
-    corner, edge_u, edge_v : (3,) array_like
-        World position of one corner, and the two edges that start there.
-    material : Material
-    texels : (2,) tuple of int
-        Resolution of its light texture along edge_u and edge_v.
-    light : str, optional
-        Name of its light if it emits: lights of one name are one layer. By default that of the quad.
-    """
-
-    name: str
-    corner: Floats
-    edge_u: Floats
-    edge_v: Floats
-    material: Material = field(default_factory=Material)
-    texels: tuple[int, int] = (16, 16)
-    light: str | None = None
-
-    def __post_init__(self) -> None:
-        if not (isinstance(self.name, str) and self.name and self.name.isprintable()):
-            raise BadInput(f"a quad's name is {self.name!r}; expected a printable text")
-        for name in ("corner", "edge_u", "edge_v"):
-            vector = np.array(getattr(self, name), dtype=float)
-            if vector.shape != (3,) or not np.isfinite(vector).all():
-                raise BadInput(f"{name} of quad {self.name!r} is {vector.tolist()}; expected three finite numbers")
-            vector.setflags(write=False)
-            object.__setattr__(self, name, vector)
-        if not self.material.plain:
-            raise BadInput(
-                f"quad {self.name!r} has a transmission, a coat or is translucent; expected that of a field only"
-            )
-        lengths = np.linalg.norm(self.edge_u) * np.linalg.norm(self.edge_v)
-        if not np.linalg.norm(np.cross(self.edge_u, self.edge_v)) > 1e-6 * lengths:
-            raise BadInput(f"the edges of quad {self.name!r} are parallel or zero; expected two that span an area")
-        texels = tuple(int(n) for n in self.texels)
-        if len(texels) != 2 or min(texels) < 1:
-            raise BadInput(f"texels of quad {self.name!r} are {self.texels}; expected two whole numbers from 1 up")
-        object.__setattr__(self, "texels", texels)
-
-    @property
-    def normal(self) -> Floats:
-        """Unit vector (3,) towards the front."""
-        across = np.cross(self.edge_u, self.edge_v)
-        return np.asarray(across / np.linalg.norm(across))
-
-    @property
-    def area(self) -> float:
-        """Area in squared world units."""
-        return float(np.linalg.norm(np.cross(self.edge_u, self.edge_v)))
-
-
-@dataclass(frozen=True, eq=False)
 class Levels:
     """A table of isovalues: row k is one setting of all sliders.
 
@@ -292,7 +176,7 @@ class Scene:
                 )
         object.__setattr__(self, "fields", fields)
         object.__setattr__(self, "quads", quads)
-        object.__setattr__(self, "background", _rgb(self.background, "background", np.inf))
+        object.__setattr__(self, "background", rgb(self.background, "background", np.inf))
         object.__setattr__(self, "lights", tuple(self.lights))
 
     @property
@@ -354,11 +238,7 @@ class Scene:
         from illumgrid.field.presets import GROUND, studio_lights
 
         scene = cls.sky(volume, albedo, range, inside, name)
-        right, front, up, centre, half = _upright_box(volume)
-        reach = 2.2 * half[:2].max()
-        ground = _wall("floor", centre - half[2] * up, reach * right, -reach * front, np.full(3, GROUND))
-        ground = _square_texels(ground, 2 * _texel(volume, 2 * reach) / (2 * reach))
-        scene = cls(scene.fields, (ground,))
+        scene = cls(scene.fields, (floor_under(volume, GROUND),))
         return replace(scene, lights=studio_lights(scene))
 
     @classmethod
@@ -427,54 +307,6 @@ def level_table(scene: Scene, count: int) -> Levels:
     return Levels(scene.levels(np.linspace(0.0, 1.0, count)))
 
 
-def upright(direction: Floats) -> tuple[Floats, Floats, Floats]:
-    """World directions (3,) right, front and up: signed axes of an array with this `direction`.
-
-    Up is the axis nearest to world +z, front the remaining axis nearest to -y (the face, in medical coordinates).
-    """
-    heights = direction[2]
-    vertical = int(np.argmax(np.abs(heights)))
-    depths = np.where(np.arange(3) == vertical, 0.0, -direction[1])
-    level = int(np.argmax(np.abs(depths)))
-    up = direction[:, vertical] * np.sign(heights[vertical])
-    front = direction[:, level] * (np.sign(depths[level]) or 1.0)
-    return np.cross(up, front), front, up
-
-
-def _upright_box(volume: Volume) -> tuple[Floats, Floats, Floats, Floats, Floats]:
-    """Right, front, up, and the centre and half extents (along those) of the box of a volume's voxel centres."""
-    axes = np.stack(upright(volume.direction), axis=1)
-    last = np.array(volume.shape) - 1.0
-    half = 0.5 * np.abs(axes.T @ (volume.direction * (last * volume.spacing))).sum(axis=1)
-    return axes[:, 0], axes[:, 1], axes[:, 2], index_to_world(volume, last / 2), half
-
-
-def _wall(name: str, centre: Floats, u: Floats, v: Floats, albedo: Floats) -> Quad:
-    """Parallelogram with half edges u and v around its centre; its front is u × v."""
-    return Quad(name, centre - u - v, 2 * u, 2 * v, Material(albedo))
-
-
-def _square_texels(quad: Quad, per_length: float) -> Quad:
-    """The quad with texels as square as they can be, so many per world unit."""
-    edges = (float(np.linalg.norm(edge)) for edge in (quad.edge_u, quad.edge_v))
-    nu, nv = (max(1, round(per_length * edge)) for edge in edges)
-    return replace(quad, texels=(nu, nv))
-
-
-def _texel(volume: Volume, longest: float) -> int:
-    """Texels along a wall of this length beside a volume: one for about three voxels, at least 6 and at most 48."""
-    side = float((np.array(volume.shape) * volume.spacing).max())
-    return int(np.clip(round(longest / side * max(volume.shape) / 3.3), 6, 48))
-
-
-def fitting_texels(quad: Quad, volume: Volume) -> Quad:
-    """A wall beside a volume with square texels, as many as those of `box_around`; one where no light is reflected."""
-    if not quad.material.albedo.any():
-        return replace(quad, texels=(1, 1))
-    longest = max(float(np.linalg.norm(edge)) for edge in (quad.edge_u, quad.edge_v))
-    return _square_texels(quad, _texel(volume, longest) / longest)
-
-
 def with_texels(scene: Scene, longest: int) -> Scene:
     """The scene with square texels, `longest` of them along the longest edge of all walls; a lamp keeps its own.
 
@@ -490,7 +322,7 @@ def with_texels(scene: Scene, longest: int) -> Scene:
     return replace(
         scene,
         quads=tuple(
-            _square_texels(quad, longest / edge) if quad.material.albedo.any() else quad for quad in scene.quads
+            square_texels(quad, longest / edge) if quad.material.albedo.any() else quad for quad in scene.quads
         ),
     )
 
@@ -505,25 +337,3 @@ def finer_texels(scene: Scene, times: float) -> Scene:
         return replace(quad, texels=(nu, nv)) if quad.material.albedo.any() else quad
 
     return replace(scene, quads=tuple(map(finer, scene.quads)))
-
-
-def box_around(volume: Volume, margin: float = 0.25) -> tuple[Quad, ...]:
-    """Six inward-facing walls around a volume, and a luminaire close above the floor; `margin` in half extents."""
-    right, front, up, centre, half = _upright_box(volume)
-    half = half + margin * half.max()
-    r, f, u = right * half[0], front * half[1], up * half[2]
-    white, red, green = np.full(3, 0.75), np.array([0.63, 0.06, 0.05]), np.array([0.14, 0.45, 0.09])
-    lamp = Quad(
-        "lamp", centre - 0.98 * u - 0.4 * r + 0.4 * f, 0.8 * r, -0.8 * f, Material(np.zeros(3), np.full(3, 8.0)), (1, 1)
-    )
-    walls = (
-        _wall("floor", centre - u, r, -f, white),
-        _wall("ceiling", centre + u, r, f, white),
-        _wall("left", centre - r, f, -u, red),
-        _wall("right", centre + r, f, u, green),
-        _wall("back", centre - f, r, u, white),
-        _wall("front", centre + f, r, -u, white),
-    )
-    longest = 2 * float(half.max())
-    fine = _texel(volume, longest) / longest  # twice that on the floor, where the lamp is near and shadows are sharp
-    return (*(_square_texels(wall, 2 * fine if wall.name == "floor" else fine) for wall in walls), lamp)

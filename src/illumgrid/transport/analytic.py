@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from illumgrid.field.lights import Distant, Sky, pixel_directions
-from illumgrid.field.scene import Field, Material, Quad, Scene, box_around, upright
+from illumgrid.field.rooms import box_around, upright
+from illumgrid.field.scene import Field, Material, Quad, Scene
 from illumgrid.field.upright import sky_axes
 from illumgrid.field.volume import Floats, Volume, index_to_world
 from illumgrid.transport.samples import Queries, join_queries

@@ -12,7 +12,8 @@ import numpy as np
 
 from illumgrid.errors import BadInput
 from illumgrid.field.lights import Distant, Light, Sky
-from illumgrid.field.scene import Field, Material, Quad, Scene, fitting_texels
+from illumgrid.field.rooms import fitting_texels
+from illumgrid.field.scene import Field, Material, Quad, Scene
 from illumgrid.field.signed import signed_pair, without_gaps
 from illumgrid.field.volume import Volume, finite, smooth
 
