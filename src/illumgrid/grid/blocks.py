@@ -118,11 +118,11 @@ def put(
 def beside_coarser(layout: Layout, index: NDArray[np.integer], step: int) -> NDArray[np.bool_]:
     """Which nodes (n, 3) of blocks of this step a coarser block holds as well: there it says what is read."""
     side, found = layout.side, np.zeros(len(index), bool)
-    most = np.array(layout.slot.shape) - 1
+    border = np.flatnonzero((index % (side * step) == 0).any(axis=1))
+    node, most = np.minimum(index[border], layout.shape - 1), np.array(layout.slot.shape) - 1
     for toward in np.ndindex(2, 2, 2):
-        box = np.clip((np.minimum(index, layout.shape - 1) - np.array(toward)) // side, 0, most)
-        slot = layout.slot[tuple(box.T)]
-        found |= (slot >= 0) & (layout.step[np.maximum(slot, 0)] > step)
+        slot = layout.slot[tuple(np.clip((node - np.array(toward)) // side, 0, most).T)]
+        found[border] |= (slot >= 0) & (layout.step[np.maximum(slot, 0)] > step)
     return found
 
 
