@@ -12,7 +12,7 @@ from illumgrid.grid.blocks import answer, beside_coarser, boxes, in_cells, laid_
 from illumgrid.grid.illumination import Held
 from illumgrid.grid.nested import all_corners, coarser
 from illumgrid.interpolators.bilateral import read
-from illumgrid.interpolators.nearest import Nearest
+from illumgrid.interpolators.neighbours import diagonal
 from illumgrid.transport.samples import Samples
 
 NUMBER = np.uint64((1 << 40) - 1)
@@ -86,13 +86,16 @@ def _level(
 
 def _coarsest(samples: Samples, place: NDArray[np.int64], nodes: Nodes, own: Nodes, step: int) -> IlluminationGrid:
     """Grid of blocks of the coarsest level, where all corners of a cell were asked."""
+    from scipy.spatial import KDTree
+
     flat = np.ravel_multi_index(tuple((place // step).T), own.spec.shape)
     light, error, support = read(samples, own, own, flat)
-    dark = support == 0  # at the rim, without a point of their own
-    if dark.any():
-        rim = Nearest().fill(samples, own)
-        for part, array in zip((light, error, support), (rim.light, rim.error, rim.support)):
-            part[dark] = array.reshape(-1, *part.shape[1:])[flat[dark]]
+    dark, lit = np.flatnonzero(support == 0), np.flatnonzero(samples.paths > 0)
+    if len(dark) and len(lit):  # at the rim, without a point of their own: the light of the nearest sample
+        tree = KDTree(samples.queries.point[lit] - own.spec.origin)
+        far, sample = tree.query(own.spec.nodes(flat[dark]) - own.spec.origin, distance_upper_bound=diagonal(own.spec))
+        dark, sample = dark[np.isfinite(far)], lit[sample[np.isfinite(far)]]
+        light[dark], error[dark], support[dark] = samples.light[sample], samples.error[sample], 1.0
     whole = own.grid_of(flat, light, error, support, samples.channels)
     asked = np.zeros(own.spec.shape, bool)
     asked.reshape(-1)[flat] = True
