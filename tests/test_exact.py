@@ -9,6 +9,7 @@ from PIL import Image
 import illumgrid as ig
 from illumgrid.errors import BadInput
 from illumgrid.field.scene import Material, Quad, Scene
+from illumgrid.field.volume import world_to_index
 from illumgrid.show import fit_camera, render
 from illumgrid.show.engines import software
 from illumgrid.show.exact import FEWEST_TRUST, MOST_TRUST, Exact, Gathering, cache_at, looked_up, steps_to, tracer_of
@@ -103,6 +104,23 @@ def test_a_lookup_without_error_is_trusted_and_one_that_is_off_is_not():
     """On the sphere under a sky that is the same from everywhere, black: E is pi."""
     right, wrong = (gathering(grey_light(value), 4).trust[0] for value in (np.pi, 1.0))
     assert right[1] < 0.02 and wrong[1] == pytest.approx((np.pi - 1) ** 2, rel=0.01)
+
+
+def test_a_node_that_knows_nothing_does_not_tell_what_is_usual():
+    """One of 20³ whose bar is a million times that of the others, and in view."""
+    light = lit(sky(ball(16), albedo=(0.0, 0.0, 0.0)), 3.0, nodes=20)
+    (grid,) = light.grids
+
+    def known(error):
+        grids = (replace(grid, values=grid.light[..., :1], error=error, channels=None),)
+        return gathering(replace(light, grids=grids), 4)
+
+    error = np.full(grid.spec.shape, 0.1, np.float32)
+    made = known(error.copy())
+    hits = visible(made)
+    index = np.round(world_to_index(grid.spec, hits.point[hits.lit(0)[500:501]]))[0]
+    error[tuple(index.astype(int))] = 1e5
+    assert 1.0 < known(error).trust[0][2] / made.trust[0][2] < 10.0  # a few per cent of the surface count as 100 each
 
 
 def test_rays_converge_to_paths_of_every_length(grey):

@@ -37,6 +37,7 @@ FEWEST_TRUST, MOST_TRUST = 4.0, 4096.0
 
 _PILOT_RAYS, _PILOT_PATHS, _PILOT_LEAST = 4096, 16, 64
 _LEAST_SHAPE = 0.1  # of a lookup's variance over the usual one: grids do not know of all that they miss
+_FAR = 100.0  # times the median of a surface's known variances: few nodes that know nothing do not tell what is usual
 _BAND = 1 << 17  # sub-samples that are traced together: bounds the memory
 
 
@@ -193,7 +194,9 @@ class Gathering:
             if not chosen.any():
                 return np.array([1.0, 0.0, 1.0])
             lookup = max(of_lookup[chosen].mean(), 0.0) + of_lookup[chosen].std() / np.sqrt(chosen.sum())
-            return np.array([of_ray[chosen].mean(), lookup, known[rows][chosen].mean()])
+            own = known[rows][chosen]
+            usual = np.minimum(own, _FAR * (np.median(own) or np.inf)).mean()
+            return np.array([of_ray[chosen].mean(), lookup, usual])
 
         each = [hits.number[rows] == k for k in range(self.surfaces)]
         whole = np.ones(len(rows), bool)

@@ -14,8 +14,15 @@ const FINE = 1 / 500; // standard error, in display radiance, at which the pictu
 const TRIAL = [96, 72], RAYS = 8; // pixels, and rays from each in either half of a trial
 const ENOUGH = 64; // pixels on which a surface is judged by itself
 const BAND = 30; // milliseconds for a part of a slow picture
+const FAR = 100;
 const OPEN = 0, DISC = 1, LAMP = 2, MIRROR = 3, IMAGE = 4;
 const SHINY = 0.35; // roughness of the shiny look
+
+// Sum of variances, the few that are far above the others taken for FAR times their median.
+function usualOf(known) {
+  const most = FAR * (known.sort((a, b) => a - b)[known.length >> 1] || Infinity);
+  return known.reduce((total, x) => total + Math.min(x, most), 0);
+}
 
 export class Resting {
   // Null where the page cannot: light that it holds no description of, or a graphics card without single precision.
@@ -130,7 +137,7 @@ export class Resting {
       for (let k = 0; k < RAYS; k++) this.gather(trial, state, k, [0.5, 0.5], true, MOST + RAYS * half);
       return read(trial.means[RAYS % 2]);
     });
-    const place = read(trial.origin), sums = [...this.surfaces, null].map(() => [0, 0, 0, 0, 0]);
+    const place = read(trial.origin), sums = [...this.surfaces, null].map(() => [0, 0, [], 0, 0]);
     for (let i = 0; i < many; i++) {
       const id = place[4 * i + 3];
       if (id < 0) continue;
@@ -142,13 +149,13 @@ export class Resting {
         }
         total[1] += product;
         total[4] += product ** 2;
-        total[2] += one[4 * i + 3];
+        total[2].push(one[4 * i + 3]);
         total[3] += 1;
       }
     }
     const all = sums.pop();
     const judged = sums.map((own) => (own[3] >= ENOUGH ? own : all)).map(([ray, lookup, usual, n, squares]) =>
-      [ray, Math.max(lookup, 0) + Math.sqrt(Math.max(squares - lookup ** 2 / Math.max(n, 1), 0)), usual].map((x) => x / Math.max(n, 1)));
+      [ray, Math.max(lookup, 0) + Math.sqrt(Math.max(squares - lookup ** 2 / Math.max(n, 1), 0)), usualOf(usual)].map((x) => x / Math.max(n, 1)));
     this.trust = judged.flat();
     this.enough = Math.max(64, Math.min(MOST, Math.ceil(Math.max(...judged.map(([ray]) => ray)) / FINE ** 2)));
   }
