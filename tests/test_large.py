@@ -19,6 +19,7 @@ from illumgrid.field.volume import Volume, histogram, interpolate, slabs, world_
 from illumgrid.grid.nodes import reachable
 from illumgrid.interpolators import nearest
 from illumgrid.samplers import coarea, direct
+from illumgrid.samplers.coarea import points_on_level_sets
 from illumgrid.show.camera import outline_of
 from illumgrid.show.viewer.arrays import field_steps
 from illumgrid.transport import walk
@@ -123,3 +124,14 @@ def test_a_further_lit_node_takes_60_bytes(monkeypatch):
         nodes.append(light.recipe["queries"])
     assert nodes[1:] == [30**3, 50**3] and len(light.grids[0].channels) == 3
     assert (peaks[2] - peaks[1]) / (nodes[2] - nodes[1]) <= 60
+
+
+def test_cells_among_which_points_are_chosen_are_held_once(monkeypatch):
+    monkeypatch.setattr(coarea, "AT_ONCE", 1 << 15)
+    scene = ig.Scene.sky(ball(70), range=(-1.0, 1.3))  # the range crosses all cells
+    points_on_level_sets(scene, 10, (0,))  # compiles
+    tracemalloc.start()
+    cells, _ = coarea._cells_by_step(scene.fields[0], np.random.default_rng(0))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert len(cells) == 69**3 and peak < 36 * len(cells)

@@ -83,3 +83,9 @@ def test_the_library_and_info_refuse_as_well_and_an_export_needs_nothing(refuse,
         ig.run(Scene.sky(ball(10)), paths=1)
     exports.write(light, tmp_path / "a.exr", on="field")  # a part at a time
     refuse("info", "v.npy", words=["info needs", "--downsample"])
+
+
+def test_of_a_large_field_only_its_wide_bricks_are_counted():
+    for each in (needs.TO_LIGHT, needs.TO_DESCRIBE):
+        assert needs.of_field(1024**3, each) < 1.3e9  # a run of 1024³ bytes took 2.1 GB, 1.1 of them the field itself
+        assert needs.of_field(256**3, each) == each * 256**3

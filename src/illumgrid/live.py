@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from illumgrid.errors import BadInput
 from illumgrid.field.scene import Levels, Scene
-from illumgrid.field.volume import Floats
+from illumgrid.field.volume import Floats, interpolate, world_to_index
 from illumgrid.grid import GREY, RGB, GridSpec, IlluminationGrid, WallTexture, channels_of, fill_holes
 from illumgrid.light import Illumination
 from illumgrid.show.viewer.arrays import HOLE
@@ -269,16 +269,17 @@ class Live:
         low, high, middle, coarse = np.zeros(count), np.ones(count), np.full((count, 3), np.nan), np.zeros(count, bool)
         for queries, begin in zip(targets, self._batches):
             for target in np.unique(queries.target).tolist():
-                of = np.flatnonzero(queries.target == target)
-                own, shape = queries[of], self._shapes[target]
-                flat[begin + of] = own.id & np.uint64((1 << 40) - 1)  # of `Direct`, and of texels
+                of, shape = np.flatnonzero(queries.target == target), self._shapes[target]
+                ids = queries.id[of]
+                flat[begin + of] = ids & np.uint64((1 << 40) - 1)  # of `Direct`, and of texels
                 index = np.array(np.unravel_index(flat[begin + of], shape))
                 if target < fields:
-                    low[begin + of] = high[begin + of] = self.scene.fields[target].place(own.level[:, target])
-                    middle[begin + of] = stage.place(own.point)
+                    level, point = self._seen(target, flat[begin + of])
+                    low[begin + of] = high[begin + of] = level
+                    middle[begin + of] = stage.place(point)
                 else:
                     low[begin + of], high[begin + of] = ((index[0] + k) / max(rows - 1, 1) for k in (-1, 1))
-                held = (own.id >> np.uint64(56)) > 0
+                held = (ids >> np.uint64(56)) > 0
                 texture[begin + of] = np.where(held, -1, target)
                 step = (STEP, STEP, STEP) if target < fields else (1, STEP, STEP)
                 sizes = [-(-n // s) for n, s in zip(shape, step)]
@@ -288,6 +289,12 @@ class Live:
                 first[:: STEP**3] |= not first.any()
                 coarse[begin + of] = first & ~held
         return _Places(texture, flat, block, coarse, *_of_blocks(block, blocks, low, high, middle))
+
+    def _seen(self, number: int, flat: NDArray[np.int64]) -> tuple[Floats, Floats]:
+        """Where in the sweep nodes are seen, and where they lie: whole queries, with normals, would take seconds."""
+        field, points = self.scene.fields[number], self.specs[number].nodes(flat)
+        level = interpolate(field.volume, world_to_index(field.volume, points))
+        return field.place(np.clip(level, *field.range)), points
 
     # --- what is there -------------------------------------------------------------------------------------------
 

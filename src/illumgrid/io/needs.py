@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from illumgrid.errors import BadInput
+from illumgrid.field.bricks import LARGE
 from illumgrid.field.lattice import GridSpec
 from illumgrid.grid import channels_of
 from illumgrid.io.readers.limits import free_memory, gigabytes
@@ -21,8 +22,9 @@ TO_DESCRIBE = 21
 """Bytes a voxel for the histogram, plateaus and warnings of a volume that is read; of a large one, see `of_field`."""
 TO_LIGHT = 44
 """Bytes a voxel for diagnosis, preparation and writing of a field; of a large one, see `of_field`."""
-_PARTS, _BRICKS = 1 << 24, 3
-"""Voxels of a field of which all are looked at together; bytes for each further one, those of its bricks."""
+_PARTS, _BRICKS, _WIDE_BRICKS = 1 << 24, 3.0, 0.5
+"""Voxels of a field of which all are looked at together; bytes for each further one, those of its bricks and a little:
+of bricks as wide again where the field is `LARGE`. The field itself is there, or paged."""
 TO_DEPOSIT = 18
 """Bytes a voxel for the density of points."""
 TO_EXTRACT = 16
@@ -43,7 +45,7 @@ def check(what: str, need: float, todo: str) -> None:
 
 def of_field(voxels: int, each: int) -> float:
     """Bytes for a field that takes `each` a voxel: a large one is looked at in parts."""
-    return each * min(voxels, _PARTS) + _BRICKS * max(0, voxels - _PARTS)
+    return each * min(voxels, _PARTS) + (_WIDE_BRICKS if voxels >= LARGE else _BRICKS) * max(0, voxels - _PARTS)
 
 
 def check_run(

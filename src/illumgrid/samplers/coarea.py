@@ -58,15 +58,23 @@ def _cells_by_step(field: Field, random: np.random.Generator) -> tuple[NDArray[n
     if field.volume.stored.size > _LOOKED_AT:
         columns = np.sort(random.choice(many, _LOOKED_AT // nz, replace=False))
     parts = [_crossed(field, columns[first : first + at_once]) for first in range(0, len(columns), at_once)]
-    cells, first, last = (np.concatenate(each) for each in zip(*parts))
-    many_in = np.cumsum(np.bincount(first, minlength=_STEPS + 1) - np.bincount(last, minlength=_STEPS + 1))
-    rare = np.concatenate([[0.0], np.cumsum(1.0 / np.maximum(many_in, 1))])
-    return cells, rare[last] - rare[first]
+    many_in = np.zeros(_STEPS + 1, np.int64)
+    for _, first, last in parts:
+        many_in += np.bincount(first, minlength=_STEPS + 1) - np.bincount(last, minlength=_STEPS + 1)
+    rare = np.concatenate([[0.0], np.cumsum(1.0 / np.maximum(np.cumsum(many_in), 1))])
+    each = [list(of) for of in zip(*parts)]
+    del parts  # there are as many cells as voxels that are looked at: their parts go as they are joined
+    cells, first, last = (np.concatenate(each.pop(0)) for _ in range(3))
+    chance = rare[last]
+    for begin in range(0, len(chance), AT_ONCE):
+        some = slice(begin, begin + AT_ONCE)
+        chance[some] -= rare[first[some]]
+    return cells, chance
 
 
 def _crossed(
     field: Field, columns: NDArray[np.int64]
-) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+) -> tuple[NDArray[np.int64], NDArray[np.int16], NDArray[np.int16]]:
     """Of the cells in some columns along the last axis, those that the range crosses: number, first step, last + 1."""
     (lowest, highest), (_, ny, nz) = map(float, field.stored_range), field.volume.shape
     x, y = np.divmod(columns, ny - 1)
@@ -79,4 +87,4 @@ def _crossed(
     first = np.maximum(np.minimum(low[:, :-1], low[:, 1:]), 0)
     last = np.minimum(np.maximum(high[:, :-1], high[:, 1:]), _STEPS - 1)
     row, z = np.nonzero(first <= last)
-    return columns[row] * (nz - 1) + z, first[row, z].astype(int), last[row, z].astype(int) + 1
+    return columns[row] * (nz - 1) + z, first[row, z].astype(np.int16), last[row, z].astype(np.int16) + np.int16(1)
