@@ -75,6 +75,14 @@ def test_pictures_show_it_under_every_setting(light):
     assert not np.array_equal(one, other)
 
 
+def test_no_light_is_known_first_that_no_path_could_end_in():
+    """In a room, whose paths are long: the rows of a level that is held are in no cache's sweep."""
+    room = Scene.box(ball(8), albedo=(0.8, 0.8, 0.8), range=(0.5, 0.8))
+    still = Field("still", ball(8), Material((0.8,) * 3), (0.3, 0.9), isovalue=0.4)
+    lights = [run(Scene((*room.fields, *more), room.quads), grid=4, paths=1, judge=False) for more in ((), (still,))]
+    assert [light.recipe["cache"] for light in lights] == [True, False]
+
+
 def test_levels_that_cannot_be_held_are_refused(tmp_path):
     refused(lambda: Field("a", ball(8), isovalue=9.0), "9", "'a'", "misses")
     np.save(tmp_path / "v.npy", ball(8).values)

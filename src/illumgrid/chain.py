@@ -158,7 +158,8 @@ def run(
     if bounces is None:
         bounces, left_out = enough_bounces(scene, tracer, seed)
         marches = capabilities(chosen[1]).surface == "levelset" and hasattr(tracer, "cache")
-        cached = marches and not at_once and has_long_paths(scene, tracer, seed)
+        held = any(field.isovalue is not None for field in scene.fields)  # such rows are in no cache's sweep
+        cached = marches and not at_once and not held and has_long_paths(scene, tracer, seed)
     elif not before:
         left_out = light_left_out(scene, tracer, bounces, seed)
     clock = time.perf_counter()
