@@ -177,7 +177,7 @@ def test_a_stop_within_a_callback_is_not_lost(tmp_path):
     call = "lambda: (print('begun', flush=True), time.sleep(1000))"
     work = f"import ctypes, time; ctypes.CFUNCTYPE(None)({call})(); time.sleep(1000)"
     code, said, left = native(tmp_path, signal.SIGTERM, work)
-    assert (code, said, left) == (130, "illumgrid: stopped; nothing was written\n", ["command.py"])
+    assert code == 130 and said.endswith("illumgrid: stopped; nothing was written\n") and left == ["command.py"]
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows waits for no pipe")

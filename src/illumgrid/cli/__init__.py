@@ -19,7 +19,7 @@ from illumgrid.cli.info import info
 from illumgrid.cli.plugins import plugins
 from illumgrid.cli.preview import preview
 from illumgrid.cli.run import run
-from illumgrid.cli.stops import listen, sentence
+from illumgrid.cli.stops import answered, listen, sentence
 from illumgrid.cli.terminal import say, say_what_compiles
 from illumgrid.cli.verify import verify
 from illumgrid.cli.view import view
@@ -97,6 +97,7 @@ def guarded(command: Callable[[], Any]) -> int:
             raise KeyboardInterrupt
         return code if isinstance(code, int) else 0
     except (typer.Abort, KeyboardInterrupt):
+        answered()
         say(sentence())
         return 130
     except BadInput as error:

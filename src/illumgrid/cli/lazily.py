@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from illumgrid.cli.long import kept
 from illumgrid.cli.outcome import finished
 from illumgrid.cli.scenes import scene_input
+from illumgrid.cli.stops import answered
 from illumgrid.cli.terminal import reported_warnings, say
 from illumgrid.errors import BadInput
 
@@ -154,6 +155,7 @@ class _Work:
 
     def __exit__(self, *stopped: object) -> None:
         """Let the piece at hand end, and what is lit be kept."""
+        answered()
         self.live.stop.set()
         while self.thread.is_alive():
             with suppress(KeyboardInterrupt):

@@ -9,6 +9,7 @@ from shutil import rmtree
 from tempfile import gettempdir, mkdtemp
 from typing import TYPE_CHECKING, Any
 
+from illumgrid.cli.stops import answered
 from illumgrid.cli.terminal import omitted_light, say
 from illumgrid.errors import tell
 from illumgrid.io import disk
@@ -63,6 +64,7 @@ def judged_light(light: "Illumination", stages: dict[str, Any], folder: Path) ->
         light = judged(light, stages["backend"])
         _advise(light, stages)
     except KeyboardInterrupt:
+        answered()
         say(f"stopped before the error was measured; the light itself is complete in {folder}")
     return light
 

@@ -18,18 +18,26 @@ from types import FrameType
 from illumgrid.io import disk
 
 PATIENCE = 0.4
-"""Seconds that the main thread has to answer a signal."""
+"""Seconds that the main thread has to raise KeyboardInterrupt."""
+AGAIN = 1.0
+"""Seconds after which KeyboardInterrupt comes again where nobody has answered it."""
+
+unanswered = [0]
+"""The signal that nobody has answered."""
 
 
 def listen(numbers: Sequence[int]) -> None:
     """Raise KeyboardInterrupt on these signals, or else end the process."""
-    came, tell = os.pipe()
+    (came, tell), (raised, note) = os.pipe(), os.pipe()
     seen, ending = [0], threading.RLock()
 
     def stop(number: int, frame: FrameType | None) -> None:
         seen[0] += 1
+        unanswered[0] = number
         with suppress(OSError):
             os.read(came, 4096)
+        with suppress(OSError):
+            os.write(note, b"!")
         with ending:  # which a thread that ends the process keeps
             raise KeyboardInterrupt
 
@@ -44,23 +52,28 @@ def listen(numbers: Sequence[int]) -> None:
                 if seen[0] == before and set(os.read(came, 4096)) & set(numbers):
                     _end()
 
-    def lost(unraisable: "sys.UnraisableHookArgs") -> None:
-        if issubclass(unraisable.exc_type, KeyboardInterrupt):  # in a callback of a library, such as LLVM's
-            again = threading.Timer(PATIENCE / 4, signal.raise_signal, [numbers[0]])
-            again.daemon = True
-            again.start()
-        else:
-            sys.__unraisablehook__(unraisable)
+    def insist() -> None:
+        while os.read(raised, 1):
+            time.sleep(AGAIN)
+            while any(signal.getsignal(number) is not stop for number in numbers):
+                time.sleep(PATIENCE)
+            if unanswered[0]:
+                signal.raise_signal(unanswered[0])
 
-    sys.unraisablehook = lost
     for number in numbers:
         signal.signal(number, stop)
     if os.name == "nt" or not numbers:  # Windows waits for no pipe
         return
-    for end in (came, tell):
+    for end in (came, tell, note):
         os.set_blocking(end, False)
     signal.set_wakeup_fd(tell, warn_on_full_buffer=False)
-    threading.Thread(target=watch, daemon=True).start()
+    for work in (watch, insist):
+        threading.Thread(target=work, daemon=True).start()
+
+
+def answered() -> None:
+    """Say that a command knows of its stop; else it comes again: libraries drop exceptions that they do not expect."""
+    unanswered[0] = 0
 
 
 def _end() -> None:

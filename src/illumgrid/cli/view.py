@@ -10,6 +10,7 @@ from illumgrid.cli.lights import SkyImage, Turn, Weights, relit
 from illumgrid.cli.long import loaded
 from illumgrid.cli.looks import Color, ColorMap, ColorRange, Look, looking, tint_of
 from illumgrid.cli.reading import given
+from illumgrid.cli.stops import answered
 from illumgrid.cli.terminal import say
 from illumgrid.errors import BadInput
 
@@ -89,3 +90,4 @@ def view(
             browse(server.address)
         with suppress(KeyboardInterrupt):  # the normal end of a server: exit 0
             server.serve_forever()
+        answered()

@@ -127,7 +127,8 @@ def temporary(prefix: str, above: Path) -> Iterator[Path]:
         yield work
     finally:
         if work is not None:
-            shutil.rmtree(work, ignore_errors=True)
+            with held():  # a stop may come again
+                shutil.rmtree(work, ignore_errors=True)
             begun.remove(work)
         if handle is not None:
             os.close(handle)
