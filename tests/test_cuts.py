@@ -87,6 +87,7 @@ def test_the_command_cuts_and_colours(call, refuse, tmp_path):
     call("run", "v.npy", "--range", 0.3, 0.9, "--grid", 6, "--paths", 2, "--no-preview", "-o", "out")
     size = ["--size", 60, 45, "-o", "a.png"]
     assert "in grey" in call("preview", "out", *size, "--clip", "x=5")
+    assert call("preview", "out", *size, "--clip", "x=500", "--split").count("x=500 leaves nothing out") == 1
     call("preview", "out", *size, "--color", "v.npy", "--cmap", "magma", "--color-range", 0, 1)
     call("preview", "out", *size, "--color", "v")
     assert np.asarray(Image.open(tmp_path / "a.png")).shape == (45, 60, 3)
@@ -103,3 +104,16 @@ def test_the_command_cuts_and_colours(call, refuse, tmp_path):
 
 def test_a_range_of_one_value_is_refused():
     refused(lambda: Tint(ball(4), limits=(1.0, 1.0)), "lower")
+
+
+def test_a_plane_that_leaves_nothing_out_or_nothing_at_all_names_the_bounds_of_the_data(light, recwarn):
+    whole = seen(light)
+    with pytest.warns(ig.errors.IllumgridWarning, match=r"clip: x=100 leaves nothing out, the data lie at x = -1 to 1"):
+        assert np.array_equal(seen(light, clip=["x=100"]), whole)
+    with pytest.warns(ig.errors.IllumgridWarning, match=r"clip: -y=-3 leaves nothing out"):
+        seen(light, clip=["-y=-3"])
+    recwarn.clear()
+    for planes in (["x=-100"], ["-z=1.5"], ["x=-0.2", "-x=0.2"]):
+        refused(lambda planes=planes: seen(light, clip=planes), f"{planes[-1]} leaves nothing", "the data lie at")
+    seen(light, clip=["x=0.5", "-x=-0.5"])
+    assert not recwarn.list

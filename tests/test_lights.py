@@ -9,7 +9,7 @@ import illumgrid as ig
 import naive
 from illumgrid.backends.numba_ import Numba
 from illumgrid.backends.reference import Reference
-from illumgrid.errors import BadInput
+from illumgrid.errors import BadInput, IllumgridWarning
 from illumgrid.field.layers import layers_of
 from illumgrid.field.levelset import marchable
 from illumgrid.field.lights import Distant, Harmonics, Sky, basis, pixel_directions, projected, rotated
@@ -300,6 +300,29 @@ def test_damaged_images_of_a_sky_are_refused(content, tmp_path):
         (tmp_path / name).write_bytes(content)
         with pytest.raises(BadInput, match=name):
             read_image(tmp_path / name)
+
+
+def test_negative_pixels_of_lossy_compression_become_0(tmp_path):
+    from illumgrid.io.readers.sky import NEGATIVE, read_image
+
+    image = np.ones((8, 16, 3), np.float32)
+    image[4, 5] = -0.5, 0, 0.25
+    exr(tmp_path / "sky.exr", image)
+    with pytest.warns(IllumgridWarning, match="file: sky.exr has 1 negative pixels of 128 .*became 0"):
+        np.testing.assert_array_equal(read_image(tmp_path / "sky.exr"), np.maximum(image, 0))
+    size = np.sin((np.arange(8) + 0.5) * np.pi / 8)  # of a pixel in each row
+    for much, allowed in ((0.99, True), (1.01, False)):
+        image = np.ones((8, 16, 3), np.float32)
+        image[0, 0] = 0
+        total = 3 * (16 * size.sum() - size[0])
+        image[0, 0, 0] = -much * NEGATIVE * total / size[0]
+        exr(tmp_path / "sky.exr", image)
+        if allowed:
+            with pytest.warns(IllumgridWarning, match="0.01 of the light"):
+                read_image(tmp_path / "sky.exr")
+        else:
+            with pytest.raises(BadInput, match=r"1 negative pixels of 128.*at most 0.01"):
+                read_image(tmp_path / "sky.exr")
 
 
 def test_a_small_sun_is_asked_for_wherever_interpolation_shows_it():

@@ -185,7 +185,8 @@ def test_options_reach_the_picture(call, out):
     expected = render(out, view=(-40, 12.5), zoom=1.5, width=70, height=50, background="navy")
     assert np.array_equal(shown("x.png"), expected)
     said = call("preview", "out", "--grid-volume", "--cut", "--view", "front", "--size", 40, 30, "-o", "g.png")
-    assert said.count("the engine") == 1 and shown("g.png").shape == (30, 40, 3)
+    assert "engine" not in said  # rays draw it, whatever the engine
+    assert shown("g.png").shape == (30, 40, 3)
     assert "engine" not in call("preview", "out", *soft, "-o", "y.png")
 
 

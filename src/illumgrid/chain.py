@@ -19,14 +19,12 @@ from illumgrid.bake import Baked, bake
 from illumgrid.bake.accumulator import Map, Progress
 from illumgrid.bake.ahead import light_ahead
 from illumgrid.bake.bounces import enough_bounces, has_long_paths, light_left_out
-from illumgrid.bake.refined import MOST
 from illumgrid.constants import BASE, PATHS
 from illumgrid.errors import BadInput, tell, tell_after
 from illumgrid.field.lattice import specs_over
 from illumgrid.field.layers import layers_of
 from illumgrid.field.scene import Levels, Scene, finer_texels, level_table, with_texels
 from illumgrid.grid import GridSpec
-from illumgrid.grid.nested import halvings
 from illumgrid.io import needs, store
 from illumgrid.light import Illumination
 from illumgrid.stages import Backend, Interpolator, Sampler
@@ -150,15 +148,14 @@ def run(
     at_once = bool(keep and keep.at_once)
     refining = before.get("refined") if before else not (at_once or grid or plan) and _refinable(scene, *chosen)
     specs = specs_over(scene, None, BASE) if refining else specs_over(scene, grid)
-    if refining:
-        needs.check_run(scene, specs, levels, 2 ** halvings(specs), MOST)
-    else:
-        needs.check_run(scene, specs, levels, getattr(chosen[2], "density", 1.0))
+    held = any(field.isovalue is not None for field in scene.fields)  # such rows are in no cache's sweep
+    at_nodes = not held and (chosen[0].name, chosen[2].name) == ("direct", "nearest")
+    density = getattr(chosen[2], "density", 1.0)
+    needs.check_run(scene, specs, levels, density, at_nodes=at_nodes, refining=bool(refining))
     automatic = bounces is None or cached
     if bounces is None:
         bounces, left_out = enough_bounces(scene, tracer, seed)
         marches = capabilities(chosen[1]).surface == "levelset" and hasattr(tracer, "cache")
-        held = any(field.isovalue is not None for field in scene.fields)  # such rows are in no cache's sweep
         cached = marches and not at_once and not held and has_long_paths(scene, tracer, seed)
     elif not before:
         left_out = light_left_out(scene, tracer, bounces, seed)

@@ -33,6 +33,7 @@ WARNINGS = {
     "border": "a solid that reaches the border of the volume",
     "empty": "isovalues of the range that have no surface",
     "anisotropy": "voxels much longer along one axis than along another",
+    "clip": "a clip plane that leaves nothing out",
     "range": "a range that goes beyond the data",
     "plan": "a time that is too short for the scene, or an error that is out of reach or takes minutes",
     "dark": "a scene without any light",

@@ -62,7 +62,7 @@ def info(
         elif extra := given(range=limits, inside=inside, **reading):
             options = ", ".join(f"--{option}" for option in extra)
             raise BadInput(
-                f"{options} came with the finished run {source}; expected a volume file with them; leave them out"
+                f"{options} came with the finished run {source}; expected a volume file, or no such options"
             )
         else:
             _describe_run(source)

@@ -12,7 +12,7 @@ import typer
 from illumgrid.cli.lights import SkyImage, Turn, Weights, relit
 from illumgrid.cli.long import loaded
 from illumgrid.cli.looks import Clips, Color, ColorMap, ColorRange, Look, looking, tint_of
-from illumgrid.cli.terminal import progress_bars, say
+from illumgrid.cli.terminal import progress_bars, reported_warnings, say
 from illumgrid.errors import BadInput, shown, shown_range
 
 if TYPE_CHECKING:
@@ -50,6 +50,7 @@ CONFLICTS = {
 """Options that exclude each other, and the reason."""
 
 
+@reported_warnings()
 def preview(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="A finished run.")],
     output: Annotated[Path | None, typer.Option("--output", "-o", metavar="PNG", help="The picture to write.")] = None,
@@ -189,7 +190,7 @@ def preview(
         say("note: cuts show the data in grey, and the light is that of the whole solid")
     wrote = f"wrote {output}" if sweep is None else f"wrote {sweep[1]}, {sweep[0]} isovalues"
     say(wrote + ("" if local or trust else f" at exposure {light.exposure * 2**exposure:.4g}"))
-    if engine == "auto" and exact is None:
+    if engine == "auto" and exact is None and not grid_volume:
         say(f"drawn by the engine {engine_used}: {why}")
 
 

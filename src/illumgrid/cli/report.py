@@ -109,8 +109,9 @@ def advice(records: Sequence[Record], parts: Sequence[Record], bounces: int) -> 
     found += [standing(r, best, bounces) for r in records if r["default"]]
     last = best[-1]
     if missed := [f"{goal:.0%}" for goal in GOALS if goal < last["rmse"]]:
+        were = "was" if len(missed) == 1 else "were"
         found.append(
-            f"{' and '.join(missed)} was not reached within this budget; the nearest was {options(last, bounces)} "
+            f"{' and '.join(missed)} {were} not reached within this budget; the nearest was {options(last, bounces)} "
             f"({cost(last)}), whose error is dominated by {dominant(last, parts)}"
         )
     return found

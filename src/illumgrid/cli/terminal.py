@@ -48,7 +48,8 @@ def reported_warnings(ignored: Sequence[str] | None = None) -> Iterator[list[str
     sentences: list[str] = []
 
     def show(message: Warning | str, category: type[Warning], *rest: Any) -> None:
-        if issubclass(category, IllumgridWarning) and str(message).partition(":")[0] not in (ignored or ()):
+        fresh = issubclass(category, IllumgridWarning) and str(message) not in sentences  # each picture may say it
+        if fresh and str(message).partition(":")[0] not in (ignored or ()):
             sentences.append(str(message))
             say(f"note: {message}")
 

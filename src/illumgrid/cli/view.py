@@ -11,7 +11,7 @@ from illumgrid.cli.long import loaded
 from illumgrid.cli.looks import Color, ColorMap, ColorRange, Look, looking, tint_of
 from illumgrid.cli.reading import given
 from illumgrid.cli.stops import answered
-from illumgrid.cli.terminal import say
+from illumgrid.cli.terminal import reported_warnings, say
 from illumgrid.errors import BadInput
 
 
@@ -64,8 +64,9 @@ def view(
                 return
             folder = finished
             say(f"{folder} is finished")
-    light = looking(relit(loaded(folder), weights, sky, turn), look)
-    tint = tint_of(light, color, cmap, color_range)
+    with reported_warnings():
+        light = looking(relit(loaded(folder), weights, sky, turn), look)
+        tint = tint_of(light, color, cmap, color_range)
     if desktop and (tint is not None or look):
         raise BadInput("--desktop came with --look or --color; expected it without them: its window shows light alone")
     if desktop:

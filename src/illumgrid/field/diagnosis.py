@@ -290,7 +290,7 @@ def _border(field: Field) -> Iterator[Finding]:
             "border",
             f"at {shown(field.widest, field.range)} the solid of field {field.name!r} meets the volume's border "
             f"({', '.join(faces)} plane, {_below(touched / total)} of the border), where it is cut and closed by a "
-            "plain cap; take a larger crop, or a --range farther inside",
+            "flat cap; take a larger crop, or a --range farther inside",
         )
 
 

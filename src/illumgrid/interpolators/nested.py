@@ -18,6 +18,9 @@ from illumgrid.transport.samples import Samples
 NUMBER = np.uint64((1 << 40) - 1)
 """The bits of the id of a query of `direct` that hold the number of its node."""
 
+BLOCKS = 256
+"""Blocks whose indices are held at a time."""
+
 
 @dataclass(frozen=True)
 class Nested:
@@ -69,12 +72,16 @@ def _level(
     mine = np.flatnonzero(_around(fresh, place, nodes, step))
     mine = mine[~beside_coarser(layout, place[mine], step)]
     # Other nodes have the light between those below. There a lookup was as far off as `bar` says; so are they.
-    index = layout.place(slice(len(held.layout), None))
-    between = answer(held.layout, held.light, below.bars, held.support, index)
-    light, error, support = (
-        np.concatenate([old, new.reshape(-1, *old.shape[1:])])
-        for old, new in zip((held.light, held.error, held.support), between)
-    )
+    old = held.light, held.error, held.support
+    light, error, support = (np.empty((len(layout), *array.shape[1:]), np.float32) for array in old)
+    for array, below_here in zip((light, error, support), old):
+        array[: len(held.layout)] = below_here
+    bars = below.bars
+    for first in range(len(held.layout), len(layout), BLOCKS):
+        some = slice(first, first + BLOCKS)
+        between = answer(held.layout, held.light, bars, held.support, layout.place(some))
+        for array, here in zip((light, error, support), between):
+            array[some] = here.reshape(-1, *array.shape[1:])
     found = read(samples, own, own, np.ravel_multi_index(tuple((place[mine] // step).T), own.spec.shape))
     lit, low, high = found[2] > 0, *nodes.field.range
     isovalue = samples.queries[mine].level[:, nodes.number]

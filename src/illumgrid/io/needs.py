@@ -13,6 +13,7 @@ from illumgrid.errors import BadInput
 from illumgrid.field.bricks import LARGE
 from illumgrid.field.lattice import GridSpec
 from illumgrid.grid import channels_of
+from illumgrid.grid.nested import finer, halvings
 from illumgrid.io.readers.limits import free_memory, gigabytes
 
 if TYPE_CHECKING:
@@ -31,8 +32,14 @@ TO_EXTRACT = 16
 """Bytes a voxel for the extraction of an isosurface."""
 _CROSSING = 270
 """Bytes, in a file of an isosurface, for each edge between voxels that it crosses."""
-_QUERY, _CHANNEL = 300, 20
-"""Bytes a query, and for each channel of its answer."""
+_QUERY, _CHANNEL, _PIECE = 300, 20, 1 << 16
+"""Bytes a query, and for each channel of its answer; queries held at a time where they are those of nodes."""
+_IN_BLOCKS, _SPARE = 25.0, 1.63
+"""Nodes that blocks hold for each lit node of the coarse lattice, at most (4 to 23 on seven volumes), and for each
+node of the finest lattice: 9³ for 8³ nodes, and those of the coarser levels."""
+_BLOCK, _BLOCK_CHANNEL, _FINEST = 80, 8, 4
+"""Bytes for each node of the blocks, and for each of its channels, while they are filled, with the moments of lit nodes
+(`aquarius-A2`: 88 with one channel, 101 with three); bytes for each node of the finest lattice, for marks."""
 _SOME = 50_000
 """Voxels that are looked at to learn what share of the nodes is asked about."""
 
@@ -49,29 +56,40 @@ def of_field(voxels: int, each: int) -> float:
 
 
 def check_run(
-    scene: "Scene", specs: Sequence[GridSpec], levels: "Levels", density: float = 1.0, lit: float = 1.0
-) -> None:
+    scene: "Scene", specs: Sequence[GridSpec], levels: "Levels", density: float = 1.0, *, at_nodes: bool = False,
+    refining: bool = False,
+) -> None:  # fmt: skip
     """Refuse a run whose nodes, walls and fields do not fit, and say which grid would.
 
-    The interpolator stores `density` times the nodes along each axis; at most `lit` times as many are lit.
+    Parameters
+    ----------
+    density : float
+        The interpolator stores so many times the nodes along each axis.
+    at_nodes : bool
+        Whether queries are those of the nodes, which need not be held.
+    refining : bool
+        Whether `specs` are coarse lattices, of more nodes where light is rough.
     """
     channels = len(channels_of(scene))
     each = _QUERY + _CHANNEL * channels
     fixed = sum(of_field(prod(field.volume.shape), TO_LIGHT) for field in scene.fields)
-    fixed += each * len(levels.table) * sum(prod(quad.texels) for quad in scene.quads)
-    nodes = 0.0
+    fixed += each * (len(levels.table) * sum(prod(quad.texels) for quad in scene.quads) + at_nodes * _PIECE)
+    nodes = finer_nodes = 0.0
     for spec, field in zip(specs, scene.fields):
-        share = _share(field, spec)
+        share, moments = _share(field, spec), 8 + 8 * channels if at_nodes else each
         # Light, error and support; errors of each light, or light a second time while holes are filled from the nodes
         # nearest to them. A denser grid has no errors of single lights.
         stored = 4 * channels + 8 + (4 * channels if share < 1 or density == 1 else 0) + (12 if share < 1 else 0)
-        nodes += prod(spec.shape) * (stored * density**3 + each * lit * share)
+        nodes += prod(spec.shape) * (stored * density**3 + moments * share)
+        finest = prod(finer(spec, halvings(specs)).shape)
+        held = min(_IN_BLOCKS * prod(spec.shape) * share, _SPARE * finest)
+        finer_nodes += (_BLOCK + _BLOCK_CHANNEL * channels) * held + _FINEST * finest
     longest, room = max(max(spec.shape) for spec in specs), 0.8 * free_memory() - fixed
     fits = int(longest * (max(room, 0.0) / nodes) ** (1 / 3))
     todo = "cut or downsample the volume"
     if fits >= 8:
         todo = f"grid={fits} would need {gigabytes(int(fixed + nodes * (fits / longest) ** 3))}"
-    check("the run", fixed + nodes, todo)
+    check("the run", fixed + (finer_nodes if refining else nodes), todo)
 
 
 def check_surface(field: "Field", isovalue: float, todo: str) -> None:

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from illumgrid.constants import MISS, QUAD
-from illumgrid.errors import BadInput
+from illumgrid.errors import BadInput, shown_range, tell
 from illumgrid.field.scene import Field, Scene
 from illumgrid.field.upright import UPS
-from illumgrid.field.volume import Floats, Volume, interpolate, world_to_index
+from illumgrid.field.volume import Floats, Volume, box_corners, interpolate, world_to_index
 
 if TYPE_CHECKING:
     from illumgrid.show.looks import Layer
@@ -39,10 +39,14 @@ def clips_of(planes: Sequence[str], scene: Scene) -> tuple[Clip, ...]:
     ------
     BadInput
         On another text, or planes that leave nothing of any volume.
-    """
-    from illumgrid.field.volume import box_corners
 
-    found = []
+    Warns
+    -----
+    IllumgridWarning
+        `clip`: of a plane beyond which no data lie.
+    """
+    boxes = [box_corners(field.volume) for field in scene.fields]
+    found: list[Clip] = []
     for text in planes:
         axis, _, place = text.partition("=")
         try:
@@ -56,9 +60,25 @@ def clips_of(planes: Sequence[str], scene: Scene) -> tuple[Clip, ...]:
             )
         normal = np.asarray(UPS[axis], float)
         found.append(Clip(normal, at * float(normal.sum())))
-        if all((box_corners(f.volume) @ normal > found[-1].offset).all() for f in scene.fields):
-            raise BadInput(f"the clip plane {text} leaves nothing of the data; expected one that passes through it")
+        along = np.concatenate(boxes) @ np.abs(normal)
+        where = f"the data lie at {axis.lstrip('-')} = {shown_range((along.min(), along.max()))}"
+        if not any(_left(box, found) for box in boxes):
+            raise BadInput(f"the clip plane {text} leaves nothing of the data; expected one that does: {where}")
+        if all((box @ normal <= found[-1].offset).all() for box in boxes):
+            tell("clip", f"{text} leaves nothing out, {where}", stacklevel=2)
     return tuple(found)
+
+
+def _left(corners: Floats, clips: Sequence[Clip]) -> bool:
+    """Whether planes leave anything of the upright box around corners (8, 3)."""
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    for normal, offset in clips:
+        axis = int(np.flatnonzero(normal)[0])
+        if normal[axis] > 0:
+            high[axis] = min(high[axis], offset)
+        else:
+            low[axis] = max(low[axis], -offset)
+    return bool((low <= high).all())
 
 
 def window(field: Field) -> tuple[float, float]:

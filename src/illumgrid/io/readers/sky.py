@@ -7,9 +7,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from illumgrid.errors import BadInput
+from illumgrid.errors import BadInput, tell
 from illumgrid.field.lights import MOST_PIXELS
 
+NEGATIVE = 0.01
+"""Negative light of an image, of its positive light, that is taken as 0: lossy compression leaves some beside lamps."""
 EXPECTED = "expected an image of the sky, .exr or .hdr, twice as wide as high"
 
 
@@ -33,9 +35,27 @@ def read_image(path: str | os.PathLike[str]) -> NDArray[np.float32]:
         raise
     except Exception as reason:  # the EXR library raises RuntimeError, ValueError...
         raise BadInput(f"{file.name} cannot be read ({type(reason).__name__}: {reason}); {EXPECTED}") from None
-    if not np.isfinite(image).all() or (image < 0).any():
-        raise BadInput(f"{file.name} has pixels that are negative or no numbers; expected radiance from 0 up")
-    return image
+    if not np.isfinite(image).all():
+        raise BadInput(f"{file.name} has pixels that are no numbers; expected radiance from 0 up")
+    return _without_negatives(file.name, image)
+
+
+def _without_negatives(name: str, image: NDArray[np.float32]) -> NDArray[np.float32]:
+    """The image with 0 for what is negative."""
+    where = (image < 0).any(axis=2)
+    if not (count := int(where.sum())):
+        return image
+    rows = len(image)
+    solid_angle = np.sin((np.arange(rows) + 0.5) * np.pi / rows)[:, None, None]
+    positive, negative = (float((np.maximum(part, 0) * solid_angle).sum()) for part in (image, -image))
+    they = f"{name} has {count} negative pixels of {where.size}"
+    if negative > NEGATIVE * positive:
+        share = f"{negative / positive:.2g} times" if positive else "more than"
+        raise BadInput(
+            f"{they}, whose light is {share} that of the others; expected at most {NEGATIVE}; save it without loss"
+        )
+    tell("file", f"{they} ({count / where.size:.2g} of them): they became 0, {negative / positive:.1g} of the light")
+    return np.maximum(image, np.float32(0))
 
 
 def _exr(file: Path) -> NDArray[np.float32]:
