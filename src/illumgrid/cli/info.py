@@ -61,9 +61,7 @@ def info(
             _describe_volume(source, limits, "below" if inside == "below" else "above", reading)
         elif extra := given(range=limits, inside=inside, **reading):
             options = ", ".join(f"--{option}" for option in extra)
-            raise BadInput(
-                f"{options} came with the finished run {source}; expected a volume file, or no such options"
-            )
+            raise BadInput(f"{options} came with the finished run {source}; expected a volume file, or no such options")
         else:
             _describe_run(source)
 
