@@ -258,3 +258,11 @@ def test_the_version_and_the_help_are_reported(call):
     everything = call("--help")
     assert all(command in everything for command in ("run", "preview", "info"))
     assert "frobnicate" in call("frobnicate", code=2)
+
+
+def test_the_command_that_smooths_begins_anew(monkeypatch):
+    """A finished run that is resumed with another blur is refused."""
+    from illumgrid.cli.outcome import again
+
+    monkeypatch.setattr("sys.argv", ["illumgrid", "run", "v.npy", "--smooth", "1", "--paths", "8", "--resume"])
+    assert again("--smooth 2") == "illumgrid run v.npy --paths 8 --smooth 2 --overwrite"

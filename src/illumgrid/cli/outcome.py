@@ -103,7 +103,7 @@ def again(options: str) -> str:
     words = ["illumgrid", *sys.argv[1:]]
     for at in [k for k, word in enumerate(words) if word == "--smooth"][::-1]:
         words[at : at + 2] = []
-    words = [word for word in words if not word.startswith("--smooth=") and word != "--overwrite"]
+    words = [word for word in words if not word.startswith("--smooth=") and word not in ("--overwrite", "--resume")]
     return f"{shlex.join(words)} {options} --overwrite"
 
 
