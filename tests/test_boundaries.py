@@ -1,10 +1,14 @@
 """The suggested range contains what people look for: the boundaries of the classes that the data hold."""
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter, label
+from scipy.signal import find_peaks
 
-from illumgrid.field.boundaries import boundaries, otsu_threshold, suggest_range
+from illumgrid.field.boundaries import _peaks, boundaries, otsu_threshold, suggest_range
 from illumgrid.field.volume import Volume, smooth
 
 GRID = np.indices((48, 44, 40)) - np.array([24, 22, 20])[:, None, None, None]
@@ -120,3 +124,25 @@ def test_a_crop_that_cuts_skin_keeps_it_in_the_range():
     for volume in (crop, wide):
         low, high, _ = suggest_range(volume)
         assert low < 95 < high
+
+
+def test_peaks_are_those_of_scipy():
+    random, several = np.random.default_rng(0), 0
+    for _ in range(300):
+        density = random.integers(0, 12, 64) / random.integers(1, 30)  # steps, so that plateaus are frequent
+        density = gaussian_filter(density, random.choice([0.0, 1.0, 2.0]), mode="constant")
+        density /= density.max()
+        padded = np.pad(density, 1)
+        expected, about = find_peaks(padded, height=0.1, prominence=0.1)
+        expected = expected[about["prominences"] > 0.5 * padded[expected]]
+        assert _peaks(density) == [(int(k) - 0.5) / 64 for k in expected]
+        several += len(expected) > 1
+    assert several > 100
+
+
+def test_a_range_is_suggested_without_the_import_of_scipy_signal():
+    """It takes half a second, for which the first picture of `view` would wait."""
+    what = "import sys, numpy as np; from illumgrid import Volume; from illumgrid.field.boundaries import suggest_range"
+    what += "; x = np.indices((20, 20, 20)) - 9.5; suggest_range(Volume(np.tanh(5 - np.sqrt((x**2).sum(axis=0)))))"
+    what += "; assert 'scipy.ndimage' in sys.modules and not {'scipy.signal', 'scipy.stats'} & set(sys.modules)"
+    subprocess.run([sys.executable, "-c", what], check=True)

@@ -15,6 +15,7 @@ from scipy.ndimage import maximum_filter, minimum_filter
 import illumgrid as ig
 from browser import browser, until  # noqa: F401
 from illumgrid.chain import run
+from illumgrid.cli import lazily
 from illumgrid.field.lattice import specs_over
 from illumgrid.field.scene import level_table
 from illumgrid.field.volume import interpolate
@@ -22,6 +23,7 @@ from illumgrid.io.partial import Partial
 from illumgrid.live import Attention, Live, Stopped
 from illumgrid.show.viewer import page
 from illumgrid.show.viewer.server import serve
+from illumgrid.show.viewer.texture import Texture
 from shapes import ball
 from test_cli_process import COMMAND
 
@@ -77,21 +79,21 @@ def test_a_coarse_lattice_comes_first_and_then_what_is_in_sight(scene, tmp_path)
     seen = []
 
     def note(live, number, rows):
-        seen.append((live.coarse.is_set(), live._places, live._batches[number] + rows))
+        seen.append((live.coarse.is_set(), live._batches[number] + rows))
 
     live = live_of(scene, tmp_path / "run", note)
     eye = np.array([0.0, -3.0, 0.3])
     live.attention = Attention(0.25, eye, np.array([0.0, 1.0, 0.0]), 0.4)
     run(scene, grid=GRID, **HOW, judge=False, keep=live)
-    places = live._places
-    before, after = (np.concatenate([rows for now, _, rows in seen if now == when]) for when in (False, True))
+    places, blocks = live._places, live._blocks
+    before, after = (np.concatenate([rows for now, rows in seen if now == when]) for when in (False, True))
     assert places.first[before].all() and not places.first[after].any()
     nodes = after[places.texture[after] == 0]
-    block = places.block[nodes]
-    away = np.maximum(places.low[block] - 0.25, 0.25 - places.high[block]).clip(0)
+    block = blocks.block[nodes]
+    away = np.maximum(blocks.low[block] - 0.25, 0.25 - blocks.high[block]).clip(0)
     third = len(nodes) // 3
     assert away[:third].max() < away[-third:].mean()
-    front = places.middle[block][away == 0][:, 1]  # the eye looks along y
+    front = blocks.middle[block][away == 0][:, 1]  # the eye looks along y
     assert front[: len(front) // 3].mean() < front[-(len(front) // 3) :].mean() - 0.1
 
 
@@ -109,6 +111,70 @@ def test_a_stop_keeps_what_is_lit_and_the_same_run_goes_on(scene, truth, tmp_pat
     again.next = (lambda choose: lambda *about: shares.append(again.share) or choose(*about))(again.next)
     assert the_same(run(scene, grid=GRID, **HOW, judge=False, keep=again), truth)
     assert 0.4 < shares[0] < 0.5
+
+
+def test_before_there_is_light_everywhere_only_coarse_nodes_are_looked_at(scene, tmp_path):
+    """Where all the others lie, and a folder for what comes in, would keep the first picture waiting."""
+    early = []
+
+    def note(live, number, rows):
+        early.append((live.coarse.is_set(), live._blocks is None, live.keeper.place.is_dir()))
+
+    run(scene, grid=GRID, **HOW, judge=False, keep=live_of(scene, tmp_path / "run", note))
+    assert early[0] == (False, True, False)
+    assert all(unplaced and not kept for coarse, unplaced, kept in early if not coarse)
+    assert early[-1] == (True, False, True)
+
+
+def test_once_there_is_light_everywhere_the_page_is_made_before_more_is_lit(tmp_path, monkeypatch):
+    """What works beside it would keep the page waiting; a stop meanwhile keeps the coarse light."""
+    monkeypatch.chdir(tmp_path)
+    np.save("ball.npy", ball(40).values)
+    made, pieces, released = page, [], threading.Event()
+    begun = Live.next
+
+    def next(live, unknown, most):
+        if live.coarse.is_set():
+            released.set()
+        else:
+            pieces.append(live)
+        return begun(live, unknown, most)
+
+    def slowly(light, up, live=0):
+        assert not released.wait(0.5)
+        made(light, up, live=live)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Live, "next", next)
+    monkeypatch.setattr("illumgrid.show.viewer.page", slowly)
+    with pytest.raises(KeyboardInterrupt):
+        lazily.look_at("ball.npy", False, None)
+    live = pieces[0]
+    assert live.coarse.is_set() and 0 < live.share < 1
+    assert live.keeper._stored == round(live.share * live._batches[-1])
+
+
+def test_light_between_coarse_nodes_lies_on_straight_lines():
+    texture = Texture.of((9, 6, 7), 3)
+    nodes = np.stack(np.indices((9, 6, 7)), axis=-1).reshape(-1, 3)
+    straight = (nodes @ np.array([[1.0, 0.0, 2.0], [3.0, 1.0, 0.0], [0.5, 4.0, 1.0]])).astype(np.float32)
+    coarse = np.flatnonzero((nodes % 4 == 0).all(axis=1))
+    texture.paint(coarse, straight[coarse], 1)
+    texture.paint(np.array([17]), np.full((1, 3), 99.0, np.float32), 1)
+    texture.fill(np.ones(3), 2)
+    between = (nodes <= [8, 4, 4]).all(axis=1) & (np.arange(len(nodes)) != 17)
+    light = texture.light.reshape(-1, 3)
+    assert np.allclose(light[between], straight[between], rtol=1e-6)
+    assert (light[17] == 99).all()
+    edge = np.ravel_multi_index((8, 5, 6), (9, 6, 7))  # beyond the last coarse node as at it
+    assert np.allclose(light[edge], straight[np.ravel_multi_index((8, 4, 4), (9, 6, 7))])
+
+
+def test_a_texture_without_light_on_coarse_nodes_has_the_mean_of_what_is_lit():
+    texture = Texture.of((6, 6, 6), 3)
+    texture.paint(np.array([8, 9]), np.array([[1, 2, 3], [3, 4, 5]], np.float32), 1)
+    texture.fill(np.ones(3), 2)
+    assert (texture.light[5, 5, 5] == (2, 3, 4)).all() and (texture.light[0, 1, 2] == (1, 2, 3)).all()
 
 
 def news(live, since=0):

@@ -10,6 +10,7 @@ import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -18,17 +19,14 @@ from numpy.typing import NDArray
 from illumgrid.errors import BadInput
 from illumgrid.field.scene import Levels, Scene
 from illumgrid.field.volume import Floats, interpolate, world_to_index
-from illumgrid.grid import GREY, RGB, GridSpec, IlluminationGrid, WallTexture, channels_of, fill_holes
+from illumgrid.grid import GREY, RGB, GridSpec, IlluminationGrid, WallTexture, channels_of
 from illumgrid.light import Illumination
 from illumgrid.show.viewer.arrays import HOLE
 from illumgrid.show.viewer.packing import MOST_NODES, Stage
+from illumgrid.show.viewer.texture import SIDE, STEP, Texture
 from illumgrid.transport.samples import Queries, Samples
 from illumgrid.transport.walk import Answer, Chooser
 
-STEP = 4
-"""Nodes from one of the coarse lattice to the next; as many on a side of a block, whose nodes are lit together."""
-SIDE = 16
-"""Nodes on a side of the boxes in which light goes to the page."""
 MOST = 1 << 24
 """Bytes of one answer to the page, and a box of every texture's share of a piece."""
 OUTSIDE, BEHIND = 0.25, 0.05
@@ -75,54 +73,20 @@ class Attention:
 
 
 @dataclass(eq=False)
-class Texture:
-    """Light that is shown (nx, ny, nz, C) of a field's nodes, or (K, nv, nu, C) of a wall's texels, as far as known."""
+class _Places:
+    """Where the light of each row goes, and whether it is of the coarse lattice."""
 
-    light: NDArray[np.float32]
-    known: NDArray[np.bool_]
-    stamps: NDArray[np.int64]
-    """Of each box of `SIDE` on a side: when its light last changed."""
-
-    @classmethod
-    def of(cls, shape: Sequence[int], channels: int) -> "Texture":
-        """Nothing is lit."""
-        boxes = [-(-n // SIDE) for n in shape]
-        return cls(np.zeros((*shape, channels), np.float32), np.zeros(shape, bool), np.zeros(boxes, np.int64))
-
-    def paint(self, flat: NDArray[np.int64], light: NDArray[np.float32], stamp: int) -> None:
-        """Put the light (n, C) of some nodes in its place."""
-        self.light.reshape(-1, self.light.shape[-1])[flat] = light
-        self.known.reshape(-1)[flat] = True
-        at = np.unravel_index(flat, self.known.shape)
-        self.stamps[tuple(index // SIDE for index in at)] = stamp
-
-    def fill(self, spacing: Floats, stamp: int) -> None:
-        """Give nodes without light that of the coarse lattice, in straight lines; what it lacks, it has from nearby."""
-        coarse = tuple(slice(None, None, STEP) for _ in range(3))
-        support = self.known[coarse].astype(np.float32)
-        if support.any():
-            even = fill_holes(spacing, self.light[coarse], support)
-        else:
-            some = self.light[self.known]
-            even = np.broadcast_to(some.mean(axis=0) if len(some) else np.float32(0), (*support.shape, 1))
-        for axis, count in enumerate(self.known.shape):
-            at = np.minimum(np.arange(count) / STEP, even.shape[axis] - 1)
-            low = at.astype(int)
-            share = (at - low).astype(np.float32).reshape([-1 if k == axis else 1 for k in range(4)])
-            high = np.minimum(low + 1, even.shape[axis] - 1)
-            even = (1 - share) * np.take(even, low, axis) + share * np.take(even, high, axis)
-        self.light[~self.known] = np.broadcast_to(even, self.light.shape)[~self.known]
-        self.stamps[:] = stamp
+    target: NDArray[np.int32]
+    texture: NDArray[np.int64]  # number of its texture, -1 for what is not shown before the end
+    flat: NDArray[np.int64]
+    first: NDArray[np.bool_]
 
 
 @dataclass(eq=False)
-class _Places:
-    """Where the light of each row goes, and what decides when it is asked for."""
+class _Blocks:
+    """What decides when a row is asked for, once the coarse lattice is lit."""
 
-    texture: NDArray[np.int64]  # number of its texture, -1 for what is not shown before the end
-    flat: NDArray[np.int64]
-    block: NDArray[np.int64]
-    first: NDArray[np.bool_]
+    block: NDArray[np.int64]  # of each row
     low: Floats  # of each block: where in the sweep it is seen
     high: Floats
     middle: Floats
@@ -173,6 +137,7 @@ class Live:
         self._batches: list[int] = [0]
         self._late: tuple[Attention, Floats] | None = None
         self._places: _Places | None = None
+        self._blocks: _Blocks | None = None
         self._left, self._paths = 1, range(0)
         self._waiting: Callable[[], None] | None = None
         self._held: list[tuple[NDArray[np.int64], Answer]] = []
@@ -186,7 +151,7 @@ class Live:
     def begin(self, targets: Sequence[Queries], order: NDArray[np.int64]) -> Chooser:
         """See `Keeper`.
 
-        Of a run that is new the keeper, which has much to look at, learns when there is light everywhere.
+        Of a run that is new the keeper, which has much to look at, learns after there is light everywhere.
         """
         self._waiting = partial(self.keeper.begin, targets, order)
         if self.chosen:
@@ -208,9 +173,10 @@ class Live:
 
     def keep(self, rows: NDArray[np.int64], answer: Answer) -> None:
         """See `Keeper`."""
+        coarse = self.coarse.is_set()
         self._held.append((rows, answer))
         self._show(rows, answer.light)
-        if self.coarse.is_set():
+        if coarse:
             self._hand_on()
             self.keeper.settle()
         if self.stop.is_set():
@@ -222,12 +188,14 @@ class Live:
             self._waiting()
             self._waiting = None
             self.keeper.known(self._paths)
-        for rows, answer in self._held:
-            self.keeper.keep(rows, answer)
-        self._held.clear()
+        while self._held:
+            self.keeper.keep(*self._held.pop(0))
 
     def flush(self) -> None:
         """See `Keeper`."""
+        if self.coarse.is_set():
+            self._hand_on()
+            self.keeper.settle()
         if not self._waiting:
             self.keeper.flush()
 
@@ -241,14 +209,17 @@ class Live:
 
     def next(self, unknown: NDArray[np.bool_], most: Sequence[int]) -> tuple[int, NDArray[np.int64]]:
         """The batch of the next piece and targets of it: the coarse lattice, then blocks that are looked at."""
-        late, rows = self._delays(), np.flatnonzero(unknown)
-        if self._places is not None and (first := rows[self._places.first[rows]]).size:
-            rows = first
-        number = int(np.searchsorted(self._batches, rows[late[rows].argmin()], side="right")) - 1
+        rows = np.flatnonzero(unknown)
+        first = rows[:0] if self._places is None else rows[self._places.first[rows]]
+        late = None if first.size else self._delays()
+        rows = first if late is None else rows
+        soonest = rows[0] if late is None else rows[late[rows].argmin()]
+        number = int(np.searchsorted(self._batches, soonest, side="right")) - 1
         begin, stop = self._batches[number : number + 2]
         own = rows[np.searchsorted(rows, begin) : np.searchsorted(rows, stop)]
-        if len(own) > most[number]:
+        if late is not None and len(own) > most[number]:
             own = np.sort(own[np.argpartition(late[own], most[number])[: most[number]]])
+        own = own[: most[number]]
         return number, own - begin
 
     def _delays(self) -> Floats:
@@ -256,39 +227,55 @@ class Live:
         looked, places = self.attention, self._places
         if places is None:
             raise RuntimeError("nothing was begun")
+        if self._blocks is None:
+            self._blocks = self._blocked(places)
         if self._late is None or self._late[0] is not looked:
-            delay = looked.delay(places.low, places.high, places.middle)[places.block]
+            blocks = self._blocks
+            delay = looked.delay(blocks.low, blocks.high, blocks.middle)[blocks.block]
             delay[places.texture < 0] += 10.0  # levels that are held: when the rest is there
             self._late = looked, delay
         return self._late[1]
 
     def _placed(self, targets: Sequence[Queries]) -> _Places:
-        stage, fields, rows = Stage.of(self.scene), len(self.specs), len(self.levels.table)
-        count, blocks = self._batches[-1], 0
-        texture, flat, block = (np.full(count, -1, np.int64) for _ in range(3))
-        low, high, middle, coarse = np.zeros(count), np.ones(count), np.full((count, 3), np.nan), np.zeros(count, bool)
+        """Where rows are shown, and which come first; quickly, since the first picture waits for it."""
+        count = self._batches[-1]
+        texture, flat, coarse = np.full(count, -1, np.int64), np.zeros(count, np.int64), np.zeros(count, bool)
+        whose = np.concatenate([np.zeros(0, np.int32), *(queries.target for queries in targets)])
         for queries, begin in zip(targets, self._batches):
             for target in np.unique(queries.target).tolist():
                 of, shape = np.flatnonzero(queries.target == target), self._shapes[target]
                 ids = queries.id[of]
                 flat[begin + of] = ids & np.uint64((1 << 40) - 1)  # of `Direct`, and of texels
-                index = np.array(np.unravel_index(flat[begin + of], shape))
-                if target < fields:
-                    level, point = self._seen(target, flat[begin + of])
-                    low[begin + of] = high[begin + of] = level
-                    middle[begin + of] = stage.place(point)
-                else:
-                    low[begin + of], high[begin + of] = ((index[0] + k) / max(rows - 1, 1) for k in (-1, 1))
                 held = (ids >> np.uint64(56)) > 0
                 texture[begin + of] = np.where(held, -1, target)
-                step = (STEP, STEP, STEP) if target < fields else (1, STEP, STEP)
-                sizes = [-(-n // s) for n, s in zip(shape, step)]
-                block[begin + of] = blocks + np.ravel_multi_index(tuple(i // s for i, s in zip(index, step)), sizes)
-                blocks += int(np.prod(sizes))
-                first = (index % STEP == 0).all(axis=0)
+                lattice = np.zeros(shape, bool)
+                lattice[::STEP, ::STEP, ::STEP] = True
+                first = lattice.reshape(-1)[flat[begin + of]]
                 first[:: STEP**3] |= not first.any()
                 coarse[begin + of] = first & ~held
-        return _Places(texture, flat, block, coarse, *_of_blocks(block, blocks, low, high, middle))
+        return _Places(whose, texture, flat, coarse)
+
+    def _blocked(self, places: _Places) -> _Blocks:
+        """Blocks of rows, and where they are seen."""
+        stage, fields, rows = Stage.of(self.scene), len(self.specs), len(self.levels.table)
+        count, blocks = self._batches[-1], 0
+        block = np.full(count, -1, np.int64)
+        low, high, middle = np.zeros(count), np.ones(count), np.full((count, 3), np.nan)
+        for begin, stop in pairwise(self._batches):
+            for target in np.unique(places.target[begin:stop]).tolist():
+                of, shape = begin + np.flatnonzero(places.target[begin:stop] == target), self._shapes[target]
+                index = np.array(np.unravel_index(places.flat[of], shape))
+                if target < fields:
+                    level, point = self._seen(target, places.flat[of])
+                    low[of] = high[of] = level
+                    middle[of] = stage.place(point)
+                else:
+                    low[of], high[of] = ((index[0] + k) / max(rows - 1, 1) for k in (-1, 1))
+                step = (STEP, STEP, STEP) if target < fields else (1, STEP, STEP)
+                sizes = [-(-n // s) for n, s in zip(shape, step)]
+                block[of] = blocks + np.ravel_multi_index(tuple(i // s for i, s in zip(index, step)), sizes)
+                blocks += int(np.prod(sizes))
+        return _Blocks(block, *_of_blocks(block, blocks, low, high, middle))
 
     def _seen(self, number: int, flat: NDArray[np.int64]) -> tuple[Floats, Floats]:
         """Where in the sweep nodes are seen, and where they lie: whole queries, with normals, would take seconds."""

@@ -65,6 +65,7 @@ def look(
         with serve(page(light, up, live=stamp).encode(), live.news) as server:
             work.ready = lambda light: setattr(server, "page", page(light, up).encode())
             work.failed = server.shutdown
+            work.served.set()
             say(f"serving {server.address} to this machine only, lighting meanwhile; stop with Ctrl-C")
             if opened:
                 browse(server.address)
@@ -147,6 +148,7 @@ class _Work:
         self.ready: Callable[[Illumination], None] = lambda light: None
         self.failed: Callable[[], None] = lambda: None
         self.problem: BaseException | None = None
+        self.served = threading.Event()
         self.thread = threading.Thread(target=self._light)
 
     def __enter__(self) -> "_Work":
@@ -190,5 +192,8 @@ class _Work:
     def _progress(self, what: str, done: int, total: int) -> None:
         from illumgrid.live import Stopped
 
+        # Once there is light everywhere, both processors make the page of it.
+        while self.live.coarse.is_set() and not self.live.stop.is_set() and not self.served.wait(0.05):
+            pass
         if self.live.stop.is_set() and not self.live.ended:
             raise Stopped

@@ -266,12 +266,22 @@ def _around_a_boundary(density: Floats, outer: float, inner: float) -> tuple[flo
 
 
 def _peaks(density: Floats) -> list[float]:
-    """Shares of the span at which boundaries are densest, each with a valley to the next."""
-    from scipy.signal import find_peaks
+    """Shares of the span at which boundaries are densest, each with a valley to the next.
 
+    As by `scipy.signal.find_peaks`, whose import takes half a second of every command that suggests a range.
+    """
     padded = np.pad(density, 1)
-    found, about = find_peaks(padded, height=0.1, prominence=0.1)
-    return [(int(k) - 0.5) / _BINS for k in found[about["prominences"] > 0.5 * padded[found]]]
+    begins = np.flatnonzero(np.diff(padded, prepend=-1.0))  # of runs of equal density
+    ends, height, found = np.append(begins[1:], len(padded)) - 1, padded[begins], []
+    for k in range(1, len(height) - 1):
+        top, before, after = height[k], height[: k + 1][::-1], height[k:]
+        if top < max(0.1, height[k - 1], height[k + 1]):
+            continue
+        # How deep one goes down on the way to what is higher, or to the end.
+        valleys = [side[: np.argmax(side > top) or len(side)].min() for side in (before, after)]
+        if top - max(valleys) >= max(0.1, np.nextafter(0.5 * top, 1.0)):
+            found.append((int(begins[k] + ends[k]) // 2 - 0.5) / _BINS)
+    return found
 
 
 def _thickness(volume: Volume, isovalue: float, inside: Side) -> float:

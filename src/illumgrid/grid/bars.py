@@ -30,6 +30,8 @@ def bend(light: Array, error: Array, lone: NDArray[np.bool_], axis: int, step: i
 
 def of_blocks(layout: Layout, light: Array, error: Array, support: Array, channels: Channels) -> Array:
     """Standard error (blocks, i, j, k) of a lookup near each node: see `illumgrid.grid.IlluminationGrid.bar`."""
+    if not ((support > 0) & np.isfinite(error)).any():
+        return np.full(error.shape, np.inf, np.float32)
     if layout.dense:
         return _with_bends(error, support, _of_lattice(channels.shown(light), error, support))
     found = np.full(error.shape, np.inf, np.float32)

@@ -122,9 +122,10 @@ def pack_values(steps: NDArray[Any], into: Bytes) -> dict[str, Any]:
 
 def pack_light(light: NDArray[np.floating], error: NDArray[np.floating], into: Bytes) -> dict[str, Any]:
     """Light (nx, ny, nz, C), grey or RGB, and its error (nx, ny, nz) as half floats, x fastest."""
-    texels = np.concatenate([light, error[..., None]], axis=3).transpose(3, 2, 1, 0)
-    half = _half(texels).reshape(len(texels), -1)
-    half[1:-1] -= half[0]  # channels are similar: the differences compress well
+    # A channel at a time, and halved before it is turned: half the bytes to move, and no array of all channels.
+    half = [_half(channel).T.ravel() for channel in (*np.moveaxis(light, 3, 0), error)]
+    for channel in half[1:-1]:
+        channel -= half[0]  # channels are similar: the differences compress well
     data = b"".join(_planes(channel) for channel in half)
     return {"shape": list(light.shape[:3]), "channels": light.shape[3], "offset": into.add(data)}
 
