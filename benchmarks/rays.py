@@ -106,7 +106,7 @@ def march_rays(fields, level, origin, direction, on, t):
     """Distances through the field, without normals, which the other methods do not compute either."""
     for i in range(len(origin)):
         x, d = (origin[i, 0], origin[i, 1], origin[i, 2]), (direction[i, 0], direction[i, 1], direction[i, 2])
-        t[i] = nearest_hit(fields, level, x, (0.0, 0.0, 0.0), d, on, NOWHERE)[0]
+        t[i] = nearest_hit(fields, level, x, (0.0, 0.0, 0.0), d, on, NOWHERE, np.int64(0))[0]
 
 
 def contenders(fields, tree, embree, level, on, origin, direction):

@@ -72,6 +72,31 @@ def test_python_may_call_what_compiled_code_calls(tmp_path, monkeypatch):
     assert sum(module.g.entrance.stats.cache_hits.values()) == 1
 
 
+def test_what_compiled_code_calls_becomes_machine_code_in_its_caller_only(tmp_path, monkeypatch):
+    from numba.core.registry import cpu_target
+
+    (tmp_path / "called.py").write_text(
+        CODE + '\n@njit()\ndef g(x):\n    if x < 0:\n        raise ValueError("below zero")\n    return f(x) + 1\n'
+    )
+    (tmp_path / "calling.py").write_text(
+        CODE.replace("def f(x)", "def h(x)").replace("2.5 * x", "2 * g(x)") + "\nfrom called import g\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    engine = cpu_target.target_context.codegen()._engine
+    for whence in "compiled", "from the disk":
+        for name in "called", "calling":
+            monkeypatch.delitem(sys.modules, name, raising=False)
+        if whence == "from the disk":
+            next((tmp_path / "__pycache__").glob("calling.h*.nbi")).unlink()  # what it calls is kept
+        calling = importlib.import_module("calling")
+        assert calling.h(2.0) == 12
+        with pytest.raises(ValueError, match="below zero"):
+            calling.h(-1.0)
+        (part,) = calling.g.overloads.values()
+        assert sum(calling.g.stats.cache_hits.values()) == (whence == "from the disk")
+        assert not engine.is_symbol_defined(part.fndesc.llvm_func_name)
+
+
 def test_nowhere_to_write(tmp_path, function, monkeypatch):
     import numba
 

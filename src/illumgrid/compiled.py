@@ -1,10 +1,12 @@
 """Compilation by Numba with a cache on disk that costs time where it fails, and never the run.
 
 Numba alone refuses to compile where it may write nowhere, and raises whatever a damaged file of its cache makes of it;
-it does not notice damage within machine code.
+it does not notice damage within machine code. And it optimises a function, with all that it calls, and makes machine
+code of it, once for each function that calls it: here, only the code of an entrance, as a whole.
 """
 
 import contextlib
+import copy
 import hashlib
 import logging
 import pickle
@@ -14,6 +16,8 @@ from typing import Any
 
 import numba
 from numba.core.caching import CompileResultCacheImpl, FunctionCache
+from numba.core.codegen import JITCodeLibrary, JITCPUCodegen
+from numba.core.compiler import Compiler
 from numba.core.registry import CPUDispatcher
 from numba.core.serialize import dumps
 
@@ -78,22 +82,70 @@ class _Cache(FunctionCache):
             _say("compiled code cannot be kept on the disk", problem)
 
 
-class _InnerSummed(_Summed):
+class _Part(JITCodeLibrary):
+    """Code that waits to be linked into that of an entrance: not optimised as a whole, and no machine code."""
+
+    def _optimize_final_module(self) -> None:
+        pass
+
+    def _finalize_final_module(self) -> None:
+        self._finalize_dynamic_globals()
+        self._finalized = True
+
+    def get_pointer_to_function(self, name: str) -> int:
+        """No address: as Numba says of what has no machine code."""
+        return 0
+
+    def serialize_using_object_code(self) -> Any:
+        """What is kept on the disk."""
+        return self.serialize_using_bitcode()
+
+
+class _Parts(JITCPUCodegen):
+    """Numba's own compiler, but that it makes parts."""
+
+    _library_class = _Part
+
+    def set_env(self, name: str, env: Any) -> None:
+        """Nothing: only code that calls Python, which no part does, asks for its environment."""
+
+
+def _parts(codegen: Any) -> Any:
+    made = copy.copy(codegen)
+    made.__class__ = _Parts
+    return made
+
+
+class PartCompiler(Compiler):
+    """For functions that only compiled code calls: option `pipeline_class` of Numba."""
+
+    def _compile_bytecode(self) -> Any:
+        library = _parts(self.state.targetctx.codegen()).create_library(self.state.func_id.func_qualname)
+        library.enable_object_caching()  # as the lowering does with a library of its own
+        self.state.library = library
+        return super()._compile_bytecode()
+
+
+class _PartSummed(_Summed):
     """Of code without an entrance from Python, which must not be taken for code that has one."""
+
+    def rebuild(self, context: Any, kept: tuple[bytes, bytes]) -> Any:
+        """From what is kept, as a part again."""
+        return super().rebuild(context.subtarget(_internal_codegen=_parts(context.codegen())), kept)
 
     def get_filename_base(self, name: str, flags: str) -> str:
         """A name of its own."""
-        return f"{super().get_filename_base(name, flags)}.inner"
+        return f"{super().get_filename_base(name, flags)}.part"
 
 
-class _InnerCache(_Cache):
-    _impl_class = _InnerSummed
+class _PartCache(_Cache):
+    _impl_class = _PartSummed
 
 
 class _Kernel(CPUDispatcher):
     """A function that compiled code calls; `entrance` compiles it once more where Python calls it.
 
-    An entrance holds a copy of the function, so that compilation takes less time where inner functions have none.
+    An entrance holds a copy of the function, optimised together with what it calls.
     """
 
     entrance: Any
@@ -127,7 +179,7 @@ def njit(**options: Any) -> Callable[[Any], Any]:
         entrance = compile_()(function)
         if not hasattr(entrance, "py_func"):  # with NUMBA_DISABLE_JIT=1
             return entrance
-        kernel = _kept(compile_(no_cpython_wrapper=True)(function), _InnerCache)
+        kernel = _kept(compile_(no_cpython_wrapper=True, pipeline_class=PartCompiler)(function), _PartCache)
         kernel.__class__ = _Kernel
         kernel.entrance = _kept(entrance, _Cache)
         return kernel

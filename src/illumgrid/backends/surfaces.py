@@ -9,7 +9,11 @@ from typing import Any
 
 from numba.extending import overload
 
-_OPTIONS = {"nogil": True, "error_model": "numpy", "_nrt": False}
+from illumgrid.compiled import PartCompiler
+
+_OPTIONS = {
+    "nogil": True, "error_model": "numpy", "_nrt": False, "no_cfunc_wrapper": True, "pipeline_class": PartCompiler
+}  # fmt: skip
 
 
 def question(stub: Any) -> Any:
