@@ -190,9 +190,25 @@ def test_between_two_renames_nobody_ends_a_process(tmp_path):
     assert code == 130 and said.endswith("a.html is written and complete\n") and left == ["a.html", "command.py"]
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows waits for no pipe")
+def test_a_stop_of_which_a_library_makes_another_exception_is_one(tmp_path):
+    work = "import time; print('begun', flush=True)"
+    work += "\n        try: time.sleep(1000)\n        except BaseException: raise ImportError('half a module') from None"
+    code, said, left = native(tmp_path, signal.SIGHUP, work)
+    assert (code, said, left) == (130, "illumgrid: stopped; nothing was written\n", ["command.py"])
+
+
+WAYS = {
+    "alone": "{}",
+    "in an exec, after which Python ends by SIGINT": "exec({!r})",
+    "as another exception": "try: exec({!r})\nexcept BaseException: raise ImportError('half a module') from None",
+}
+
+
+@pytest.mark.parametrize("way", WAYS.values(), ids=WAYS)
 @pytest.mark.parametrize("stop", disk.STOPS)
-def test_a_stop_during_the_imports_has_no_traceback(tmp_path, stop):
-    (tmp_path / "typer.py").write_text(f"import os, time; os.kill(os.getpid(), {int(stop)}); time.sleep(9)")
+def test_a_stop_during_the_imports_has_no_traceback(tmp_path, stop, way):
+    (tmp_path / "typer.py").write_text(way.format(f"import os, time; os.kill(os.getpid(), {int(stop)}); time.sleep(9)"))
     path = os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])
     done = subprocess.run(
         [*COMMAND, "--version"], capture_output=True, text=True, env={**os.environ, "PYTHONPATH": path}

@@ -1,23 +1,37 @@
 """Run the command line, as ``illumgrid`` and as ``python -m illumgrid``."""
 
+import os
 import signal
 import sys
+from contextlib import suppress
+from types import FrameType
 
 
 def main() -> None:
     """Import the command line and run it; Ctrl-C, SIGTERM and SIGHUP end it without a traceback wherever it is."""
-    for name in ("SIGTERM", "SIGHUP"):
+    came = []
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        came.append(number)
+        raise KeyboardInterrupt
+
+    for name in ("SIGINT", "SIGTERM", "SIGHUP"):
         number = getattr(signal, name, None)  # Windows has no SIGHUP, and nohup ignores it
         if number is not None and signal.getsignal(number) != signal.SIG_IGN:
-            signal.signal(number, signal.default_int_handler)
+            signal.signal(number, stop)
     try:
         from illumgrid.cli import main as command
 
         command()
-    except KeyboardInterrupt:  # before the command has begun, or after its end
+    except (KeyboardInterrupt, Exception) as error:  # before the command has begun, or after its end
+        if not came and not isinstance(error, KeyboardInterrupt):  # an import makes another exception of a stop
+            raise
         sentence = getattr(sys.modules.get("illumgrid.cli.stops"), "sentence", None)
-        sys.stderr.write(f"{sentence() if sentence else 'illumgrid: stopped; nothing was written'}\n")
-        raise SystemExit(130) from None
+        with suppress(OSError, ValueError):
+            sys.stdout.flush()
+            sys.stderr.write(f"{sentence() if sentence else 'illumgrid: stopped; nothing was written'}\n")
+            sys.stderr.flush()
+        os._exit(130)  # Python ends by SIGINT where the stop came within exec, as in the making of a dataclass
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ from illumgrid.cli.info import info
 from illumgrid.cli.plugins import plugins
 from illumgrid.cli.preview import preview
 from illumgrid.cli.run import run
-from illumgrid.cli.stops import answered, listen, sentence
+from illumgrid.cli.stops import answered, listen, sentence, unanswered
 from illumgrid.cli.terminal import say, say_what_compiles
 from illumgrid.cli.verify import verify
 from illumgrid.cli.view import view
@@ -97,17 +97,27 @@ def guarded(command: Callable[[], Any]) -> int:
             raise KeyboardInterrupt
         return code if isinstance(code, int) else 0
     except (typer.Abort, KeyboardInterrupt):
-        answered()
-        say(sentence())
-        return 130
-    except BadInput as error:
-        say(f"illumgrid: {in_options(str(error))}")
-    except MemoryError:
-        say("illumgrid: out of memory; choose a coarser --grid or a smaller volume")
-    except OSError as error:
-        say(f"illumgrid: {error.strerror or error}{f': {error.filename}' if error.filename else ''}")
+        return _stopped()
     except Exception as error:
-        if not hasattr(error, "show"):  # no usage error, neither of click nor of typer's own copy of it
-            raise
+        return _stopped() if unanswered[0] else _failed(error)  # libraries make other exceptions of a stop
+
+
+def _stopped() -> int:
+    answered()
+    say(sentence())
+    return 130
+
+
+def _failed(error: Exception) -> int:
+    """Say what was wrong, in a sentence; what nobody expected has a traceback."""
+    if isinstance(error, BadInput):
+        say(f"illumgrid: {in_options(str(error))}")
+    elif isinstance(error, MemoryError):
+        say("illumgrid: out of memory; choose a coarser --grid or a smaller volume")
+    elif isinstance(error, OSError):
+        say(f"illumgrid: {error.strerror or error}{f': {error.filename}' if error.filename else ''}")
+    elif hasattr(error, "show"):  # a usage error, of click or of typer's own copy of it
         error.show()
+    else:
+        raise error
     return 2
