@@ -193,7 +193,7 @@ def test_between_two_renames_nobody_ends_a_process(tmp_path):
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows waits for no pipe")
 def test_a_stop_of_which_a_library_makes_another_exception_is_one(tmp_path):
     work = "import time; print('begun', flush=True)"
-    work += "\n        try: time.sleep(1000)\n        except BaseException: raise ImportError('half a module') from None"
+    work += "\n        try: time.sleep(999)\n        except BaseException: raise ImportError('half a module') from None"
     code, said, left = native(tmp_path, signal.SIGHUP, work)
     assert (code, said, left) == (130, "illumgrid: stopped; nothing was written\n", ["command.py"])
 
