@@ -122,7 +122,7 @@ class PartCompiler(Compiler):
     def _compile_bytecode(self) -> Any:
         library = _parts(self.state.targetctx.codegen()).create_library(self.state.func_id.func_qualname)
         library.enable_object_caching()  # as the lowering does with a library of its own
-        self.state.library = library
+        self.state["library"] = library
         return super()._compile_bytecode()
 
 

@@ -12,6 +12,7 @@ from illumgrid.constants import CAP
 from illumgrid.field.levelset import Marchable
 
 jit = cached(cubics, march, simd, constants, _nrt=False)  # as in `march`
+inlined = cached(cubics, march, simd, constants, _nrt=False, forceinline=True)
 
 
 @jit
@@ -25,15 +26,20 @@ def outward(gx, gy, gz):
     return -gx / length, -gy / length, -gz / length
 
 
-@jit
-def cell_normal(scene, f, ux, uy, uz):
-    """Outward normal at index u of the trilinear cell of field f that holds it."""
+@inlined
+def cell_at(scene, f, ux, uy, uz):
+    """The cell of field f that holds index u, where in it u lies, 0 to 1, and steps of flat numbers along x and y."""
     last_x, last_y, last_z = scene.shape[f, 0] - 1, scene.shape[f, 1] - 1, scene.shape[f, 2] - 1
     cx, cy = follow(ux, 0.0, 0.0, 0, last_x - 1), follow(uy, 0.0, 0.0, 0, last_y - 1)
     cz = follow(uz, 0.0, 0.0, 0, last_z - 1)
     wx, wy, wz = min(max(ux - cx, 0.0), 1.0), min(max(uy - cy, 0.0), 1.0), min(max(uz - cz, 0.0), 1.0)
-    step_y = scene.shape[f, 2]
-    step_x = step_y * scene.shape[f, 1]
+    return cx, cy, cz, wx, wy, wz, scene.shape[f, 2] * scene.shape[f, 1], scene.shape[f, 2]
+
+
+@jit
+def cell_normal(scene, f, ux, uy, uz):
+    """Outward normal at index u of the trilinear cell of field f that holds it."""
+    cx, cy, cz, wx, wy, wz, step_x, step_y = cell_at(scene, f, ux, uy, uz)
     here = scene.start[f] + cx * step_x + cy * step_y + cz
     _, gx, _, _ = cubic(scene.values, scene.sign[f], here, step_x, step_y, 0.0, wx, wy, wz, 1.0, 0.0, 0.0)
     _, gy, _, _ = cubic(scene.values, scene.sign[f], here, step_x, step_y, 0.0, wx, wy, wz, 0.0, 1.0, 0.0)
@@ -47,12 +53,8 @@ def gradient_normal(scene, f, ux, uy, uz):
 
     Where they cancel, that of the trilinear cell.
     """
+    cx, cy, cz, wx, wy, wz, step_x, step_y = cell_at(scene, f, ux, uy, uz)
     last_x, last_y, last_z = scene.shape[f, 0] - 1, scene.shape[f, 1] - 1, scene.shape[f, 2] - 1
-    cx, cy = follow(ux, 0.0, 0.0, 0, last_x - 1), follow(uy, 0.0, 0.0, 0, last_y - 1)
-    cz = follow(uz, 0.0, 0.0, 0, last_z - 1)
-    wx, wy, wz = min(max(ux - cx, 0.0), 1.0), min(max(uy - cy, 0.0), 1.0), min(max(uz - cz, 0.0), 1.0)
-    step_y = scene.shape[f, 2]
-    step_x = step_y * scene.shape[f, 1]
     v, start = scene.values, scene.start[f]
     gx, gy, gz = 0.0, 0.0, 0.0
     for corner in range(8):

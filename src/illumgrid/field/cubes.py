@@ -24,10 +24,8 @@ def march(values: NDArray[np.float32], level: float, winding: Winding) -> tuple[
     cut = 2 * wide * deep > AT_ONCE
     rows, wide = (1, max(1, AT_ONCE // (2 * deep) - 1)) if cut else (max(1, AT_ONCE // (wide * deep)), wide)
     vertices, faces, count = [np.zeros((0, 3))], [np.zeros((0, 3), np.int64)], 0
-    starts, begins = (
-        list[int](),
-        list[int](),
-    )  # of the slab before and this one: where the faces begin that a strip meets
+    starts: list[int] = []  # of the slab before: where the faces begin that a strip meets
+    begins: list[int] = []  # of this one
     for first in range(0, values.shape[0] - 1, rows):
         met, starts, begins, done = np.concatenate(faces[-max(1, len(begins)) :]), begins, [], 0
         for low in range(0, values.shape[1] - 1, wide):
