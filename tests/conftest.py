@@ -1,15 +1,20 @@
 """The command line as a function, shared by all its tests; kernels that one worker compiles for all."""
 
 import contextlib
+import functools
 import hashlib
 import os
 import signal
+import sys
 import time
 
 import numpy as np
 import pytest
+import typer
+from numba.core.dispatcher import Dispatcher
 
 import illumgrid as ig
+import naive
 from illumgrid import chain, cli
 from illumgrid import show as preview
 from illumgrid.compiled import _Cache
@@ -19,6 +24,35 @@ try:
     import fcntl
 except ImportError:  # on Windows every worker compiles
     fcntl = None
+
+# Some 200 processes start below, each of which would translate the package anew; Numba writes into the same folders.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
+
+
+def uncounted(work):
+    """The same function without the trace of coverage (not that of a debugger), which doubles the time it takes."""
+
+    @functools.wraps(work)
+    def quick(*args, **options):
+        if not type(trace := sys.gettrace()).__module__.startswith("coverage"):
+            return work(*args, **options)
+        sys.settrace(None)
+        try:
+            return work(*args, **options)
+        finally:
+            sys.settrace(trace)
+
+    return quick
+
+
+# What is not ours to count: Numba's compiler, a third of the suite's time with coverage, and the loops of the oracle.
+Dispatcher.compile = uncounted(Dispatcher.compile)
+for loops in ("path_worth", "is_hole", "solve"):
+    setattr(naive, loops, uncounted(getattr(naive, loops)))
+
+# Typer makes all commands anew for each call, which takes longer than most of what 2,000 calls below ask for.
+typer.main.get_command = functools.cache(typer.main.get_command)
 
 # A judgement takes longer than the runs of most tests: those that are about it ask for it, or have the mark `judged`.
 chain.run.__kwdefaults__["judge"] = False
