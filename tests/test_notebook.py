@@ -2,13 +2,19 @@
 
 import base64
 import builtins
+import gzip
+import json
+import threading
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from browser import browser, coloured, pair, with_separate_lights  # noqa: F401
+import illumgrid as ig
+from browser import browser, coloured, pair, until, with_separate_lights  # noqa: F401
 from illumgrid.field.lights import Distant
+from illumgrid.live import Live
+from illumgrid.notebook import show
 from illumgrid.show.viewer.widget import _widget_class
 from shapes import lit, refused, sky
 
@@ -25,6 +31,8 @@ light
     "view = light.show(isovalue=2400)\nview",
     "view.isovalue = 2700\nseen = []\nview.observe(lambda change: seen.append(change.new), 'isovalue')",
     "view.isovalue = 1e9\nprint(seen, view.range)",
+    "from illumgrid.notebook import show\njob = show(light.scene, grid=9, paths=2)\njob",
+    "print(job.wait().grids[0].spec.shape)",
 ]
 
 
@@ -42,29 +50,99 @@ def test_a_notebook_shows_a_picture_and_a_view_whose_isovalue_can_be_set(request
     state = states[view["model_id"]]["state"]
     assert state["isovalue"] == 3000.0  # kept within the range
     assert state["_anywidget_id"].endswith("View") and "WebGL2" in state["_esm"]
+    assert "application/vnd.jupyter.widget-view+json" in book.cells[4].outputs[0].data
+    assert book.cells[5].outputs[0].text == "(9, 9, 9)\n"
     assert book.cells[3].outputs[0].text == "[3000.0] (2100.0, 3000.0)\n"
 
 
-def shown(browser, view):  # noqa: F811
-    """A page that shows the view, led by a model that stands for a notebook's; and a list of what goes wrong in it."""
+def shown(browser, view, ask=None):  # noqa: F811
+    """A page that shows the view, led by a model that stands for a notebook's; and a list of what goes wrong in it.
+
+    What it sends, `ask` answers.
+    """
     names = ("isovalue", "weights", "height", "_scene", "_shaders", "_style", "_markup")
     traits = {name: getattr(view, name) for name in names}
     page = browser.context.new_page()
     troubles = []
     page.on("pageerror", lambda error: troubles.append(str(error)))
+    if ask:
+        page.expose_function("ask", ask)
     page.set_content("<div id=here style='width: 160px'></div>")
     lead = """async ([script, traits, data]) => {
-        const bytes = Uint8Array.from(atob(data), (c) => c.charCodeAt(0)), handlers = {};
-        traits._data = new DataView(bytes.buffer);
+        const view = (text) => new DataView(Uint8Array.from(atob(text), (c) => c.charCodeAt(0)).buffer);
+        const handlers = {};
+        traits._data = view(data);
         globalThis.model = { get: (k) => traits[k], set: (k, v) => { traits[k] = v },
             save_changes: () => { model.saved = traits.isovalue },
             on: (k, f) => { handlers[k] = f }, off: () => {},
+            send: async ({ number, question }) => { for (const [said, held] of await ask(number, question))
+                handlers['msg:custom'](said, held.map(view)) },
             lead: (v, k = 'isovalue') => { traits[k] = v; handlers[`change:${k}`]() } };
         const module = await import(URL.createObjectURL(new Blob([script], { type: 'text/javascript' })));
         await module.default.render({ model, el: document.getElementById('here') });
     }"""
     page.evaluate(lead, [view._esm, traits | {"height": 140}, base64.b64encode(view._data).decode()])
     return page, troubles
+
+
+@pytest.fixture
+def gate(monkeypatch):
+    """More than coarse light comes when it is set."""
+    opened, choose = threading.Event(), Live.next
+    monkeypatch.setattr(
+        Live, "next", lambda live, *what: (live.coarse.is_set() and opened.wait(60), choose(live, *what))[1]
+    )
+    yield opened
+    opened.set()
+
+
+def test_a_view_is_coarse_at_once_and_asks_for_the_rest_as_it_comes(browser, gate):  # noqa: F811
+    pytest.importorskip("anywidget")
+    scene, few = sky(), {"grid": 21, "paths": 4, "isovalues": 6}
+    job = show(scene, **few, height=140)
+    assert job.light is None and json.loads(job.view._scene)["live"] > 0
+    asked = []
+
+    def ask(number, question):
+        """What a kernel does with a message of a view."""
+        said = []
+        job.view.send = lambda content, buffers=(): said.append(
+            (content, [base64.b64encode(b).decode() for b in buffers])
+        )
+        job.view._handle_custom_msg({"number": number, "question": question}, [])
+        asked.append(question)
+        return said
+
+    page, troubles = shown(browser, job.view, ask)
+    subtitle = "document.querySelector('#here > div').shadowRoot.querySelector('[data-part=subtitle]').textContent"
+    until(page, f"{subtitle}.includes(' of the light is there')")
+    gate.set()
+    light = job.wait()
+    until(page, f"{subtitle}.startsWith('All light is there. Show it again')")
+    assert not troubles and "since=" in asked[0] and "sweep=0.5" in asked[0]
+    page.close()
+    whole = ig.run(scene, **few, judge=False)
+    assert np.array_equal(light.grids[0].light, whole.grids[0].light)
+    assert json.loads(job.view._scene)["live"] == 0 and gzip.decompress(job.view._data) == gzip.decompress(
+        whole.show(height=140)._data
+    )
+
+
+def test_light_in_a_notebook_can_be_stopped_and_what_goes_wrong_is_said(gate):
+    pytest.importorskip("anywidget")
+    job = show(sky(), grid=21, paths=4)
+    threading.Timer(0.5, gate.set).start()
+    job.stop()
+    with pytest.raises(Exception, match="stopped before all light"):
+        job.wait()
+    said = []
+    job.view.send = lambda content, buffers=(): said.append((content["number"], len(buffers)))
+    job.view._handle_custom_msg({"number": 7, "question": "since=0"}, [])
+    job._problem = MemoryError("none is left")
+    job.view._handle_custom_msg({"number": 8, "question": "since=0"}, [])
+    assert said == [(7, 1), (8, 0)]
+    refused(lambda: show(sky(), grid=1), "grid", "at least 2")
+    refused(lambda: show(sky(), paths=0), "paths", "0")
 
 
 def test_the_view_follows_the_model_and_leads_it(browser):  # noqa: F811

@@ -271,7 +271,7 @@ class Illumination:
         """
         from illumgrid.show.viewer.widget import widget
 
-        return widget(self, isovalue, height, up, tint)
+        return widget(self, isovalue=isovalue, height=height, up=up, tint=tint)
 
     def _repr_png_(self) -> bytes:
         """Still picture, as a notebook shows it."""

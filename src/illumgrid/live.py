@@ -19,16 +19,18 @@ from numpy.typing import NDArray
 from illumgrid.errors import BadInput
 from illumgrid.field.scene import Levels, Scene
 from illumgrid.field.volume import Floats, interpolate, world_to_index
-from illumgrid.grid import GREY, RGB, GridSpec, IlluminationGrid, WallTexture, channels_of
+from illumgrid.grid import GREY, RGB, GridSpec, WallTexture, channels_of
 from illumgrid.light import Illumination
 from illumgrid.show.viewer.arrays import HOLE
 from illumgrid.show.viewer.packing import MOST_NODES, Stage
-from illumgrid.show.viewer.texture import SIDE, STEP, Texture
+from illumgrid.show.viewer.texture import SIDE, STEP, Coming, Texture
 from illumgrid.transport.samples import Queries, Samples
 from illumgrid.transport.walk import Answer, Chooser
 
 MOST = 1 << 24
 """Bytes of one answer to the page, and a box of every texture's share of a piece."""
+_APART = np.array([1e3, 1.0, 1.0])
+"""Between rows and texels of a wall, for the distance to what is lit: a row shows its own light."""
 OUTSIDE, BEHIND = 0.25, 0.05
 """Of a whole sweep: how much later blocks out of view, and in view behind others, come."""
 
@@ -134,6 +136,7 @@ class Live:
         self._shapes += [(len(self.levels.table), *quad.texels[::-1]) for quad in self.scene.quads]
         self._textures = [Texture.of(shape, own) for shape in self._shapes]
         self._lock, self._stamp, self._scale = threading.Lock(), 0, 1.0
+        self._first, self._filled = 0, False
         self._batches: list[int] = [0]
         self._late: tuple[Attention, Floats] | None = None
         self._places: _Places | None = None
@@ -290,6 +293,7 @@ class Live:
         if places is None:
             return
         with self._lock:
+            self._fill()
             self._stamp += 1
             for number in np.unique(places.texture[rows]).tolist():
                 if number >= 0:
@@ -299,34 +303,38 @@ class Live:
             self._left -= len(rows)
             if not self.coarse.is_set() and self._lit[places.first].all():
                 self._stamp += 1
-                for texture, spec in zip(self._textures, self.specs):
-                    texture.fill(STEP * spec.spacing, self._stamp)
+                self._first = self._stamp
                 for texture in self._textures[len(self.specs) :]:
-                    texture.fill(np.array([1e3, 1.0, 1.0]), self._stamp)
+                    texture.fill(_APART, self._stamp)
                 self.coarse.set()
+
+    def _fill(self) -> None:
+        """Give all nodes light, once: the page, which begins with the coarse lattice, does not wait for it."""
+        if self._filled or not self.coarse.is_set():
+            return
+        self._filled = True
+        for texture, spec in zip(self._textures, self.specs):
+            texture.fill(STEP * spec.spacing, self._first)
 
     @property
     def share(self) -> float:
         """Of all targets, those that are lit."""
         return 1 - self._left / max(self._batches[-1], 1)
 
-    def light(self) -> tuple[Illumination, int]:
-        """The light that is there, as it is shown, and its stamp; its errors are not known before the end."""
+    def light(self) -> tuple[Illumination, Coming]:
+        """Light on the coarse lattice, as a page begins with it, and what is to come; its errors are not known yet."""
         channels = GREY if channels_of(self.scene).grey else RGB
         with self._lock:
-            grids = tuple(
-                IlluminationGrid(
-                    spec, t.light.copy(), np.full(spec.shape, np.inf, np.float32), t.known.astype(np.float32), channels
-                )
-                for t, spec in zip(self._textures, self.specs)
-            )
+            fields = self._textures[: len(self.specs)]
+            grids = tuple(texture.every_fourth(spec, channels) for texture, spec in zip(fields, self.specs))
+            beyond = any(t.known.sum() > t.known[::STEP, ::STEP, ::STEP].sum() for t in fields)
             walls = tuple(
                 WallTexture(t.light.copy(), t.known.astype(np.float32), channels)
                 for t in self._textures[len(self.specs) :]
             )
             shown = Illumination(self.scene, self.levels, grids, walls, {"seed": 0})
             self._scale = shown.exposure / np.pi
-            return shown, self._stamp
+            return shown, Coming(1 if beyond else self._stamp, self.specs)  # 1: all boxes are newer
 
     def news(self, asked: Mapping[str, Sequence[str]]) -> bytes:
         """What changed since the page last asked, which says what it shows: a header in JSON, then half floats.
@@ -339,6 +347,7 @@ class Live:
         data: list[bytes] = []
         room = MOST
         with self._lock:
+            self._fill()
             found = [(int(t.stamps[at]), k, at) for k, t in enumerate(self._textures) for at in _newer(t.stamps, since)]
             found.sort(key=lambda each: each[0])
             upto = self._stamp

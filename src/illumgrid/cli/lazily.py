@@ -48,6 +48,7 @@ def look(
     from illumgrid.field.scene import level_table
     from illumgrid.live import Live
     from illumgrid.show.viewer import page
+    from illumgrid.show.viewer.packing import opening
     from illumgrid.show.viewer.server import serve
 
     _check(stages, scene)
@@ -59,10 +60,11 @@ def look(
 
     work = _Work(live, partial(run, scene, **stages, **numbers, judge=False, keep=live), finish)
     with closing(keep), work:
+        view = opening(scene, up)  # meanwhile
         if not work.first():
             return
-        light, stamp = live.light()
-        with serve(page(light, up, live=stamp).encode(), live.news) as server:
+        light, coming = live.light()
+        with serve(page(light, up, coming=replace(coming, opening=view)).encode(), live.news) as server:
             work.ready = lambda light: setattr(server, "page", page(light, up).encode())
             work.failed = server.shutdown
             work.served.set()

@@ -8,6 +8,7 @@ for: those whose surfaces are steep.
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import reduce
 from itertools import product
 
 import numpy as np
@@ -223,21 +224,23 @@ def _boundary_voxels(volume: Volume, inside: Side) -> tuple[Floats, Floats]:
         ground.append(length[counted][part[counted] < threshold])
         within = np.zeros(part.shape, bool)
         within[counted] = length[counted] > _FLAT * length.max()
-        index = np.argwhere(within)
-        own = length[within]
-        along = gradient[:, within].T / step
-        along /= np.abs(along).max(axis=1, keepdims=True)
-        ahead, behind = (map_coordinates(length, (index + s * along).T, order=1, mode="nearest") for s in (1, -1))
-        ridge = own > (1 + _RIDGE) * np.maximum(ahead, behind)
-        value.append(part[within][ridge])
+        flat = np.flatnonzero(within)
+        index, own = np.array(np.unravel_index(flat, part.shape)), length.ravel()[flat]
+        along = gradient.reshape(3, -1).take(flat, axis=1) / step[:, None]
+        along /= reduce(np.maximum, np.abs(along))
+        ridge = np.arange(len(flat))
+        for way in (1, -1):  # what is not steeper than the voxel ahead is not asked for the one behind
+            at = index.take(ridge, axis=1) + way * along.take(ridge, axis=1)
+            ridge = ridge[own[ridge] > (1 + _RIDGE) * map_coordinates(length, at, order=1, mode="nearest")]
+        value.append(part.ravel()[flat[ridge]])
         slope.append(own[ridge])
-    values, slopes, flat = (np.concatenate(parts).astype(float) for parts in (value, slope, ground))
+    values, slopes, level = (np.concatenate(parts).astype(float) for parts in (value, slope, ground))
     if len(slopes) < _FEWEST:
         return values, slopes
     by_slope = np.sort(slopes)
     upto = np.cumsum(by_slope)
     strong = by_slope[min(np.searchsorted(upto, 0.9 * upto[-1]), len(by_slope) - 1)]
-    noise = _NOISE * float(np.quantile(flat, 0.8)) if len(flat) else 0.0
+    noise = _NOISE * float(np.quantile(level, 0.8)) if len(level) else 0.0
     steep = slopes > np.clip(noise, _STEEP[0] * strong, _STEEP[1] * strong)
     return values[steep], slopes[steep]
 

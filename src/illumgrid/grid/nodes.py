@@ -38,6 +38,8 @@ def _overlapped(cells: int, grid_cells: int) -> list[slice]:
 
 def _any_overlapped(cells: NDArray[np.bool_], parts: list[slice], axis: int) -> NDArray[np.bool_]:
     """Whether any of the cells of each part is marked, along an axis."""
+    if len(parts) == cells.shape[axis]:
+        return cells
     ends = [end for part in parts for end in (part.start, part.stop)]
     beyond = np.zeros_like(cells.take([0], axis))  # the end of the last part must be a place as well
     whole = np.logical_or.reduceat(np.concatenate([cells, beyond], axis), ends, axis)

@@ -17,6 +17,7 @@ from illumgrid.light import Illumination
 
 if TYPE_CHECKING:
     from illumgrid.show.tints import Tint
+    from illumgrid.show.viewer.texture import Coming
 
 MODULES = (
     "numbers",
@@ -80,7 +81,7 @@ def policy(text: str, live: bool = False) -> str:
     return f"default-src 'none'; {allowed}; base-uri 'none'; form-action 'none'"
 
 
-def page(light: Illumination, up: str | None = None, tint: "Tint | None" = None, live: int = 0) -> str:
+def page(light: Illumination, up: str | None = None, tint: "Tint | None" = None, coming: "Coming | None" = None) -> str:
     """One HTML file that holds everything: it opens from disk and makes no network request.
 
     Parameters
@@ -90,8 +91,8 @@ def page(light: Illumination, up: str | None = None, tint: "Tint | None" = None,
         World direction that is up, as in `illumgrid.show.fit_camera`.
     tint : Tint, optional
         A second quantity that colours all fields.
-    live : int
-        Above 0 the page, which is made quickly, asks the server that it came from for light that is newer than this.
+    coming : Coming, optional
+        The light is coarse, and the page, which is made quickly, asks the server that it came from for the rest.
 
     Returns
     -------
@@ -100,8 +101,8 @@ def page(light: Illumination, up: str | None = None, tint: "Tint | None" = None,
     """
     from illumgrid.show.viewer.packing import packed
 
-    scene, data = packed(light, up, tint)
-    scene["live"] = live
+    scene, data = packed(light, up, tint, coming)
+    live = coming is not None
     parts = {
         "title": html.escape(scene["title"]) + " · illumgrid",
         "style": source("view.css"),
@@ -109,7 +110,7 @@ def page(light: Illumination, up: str | None = None, tint: "Tint | None" = None,
         "shaders": _json(shaders()),
         "scene": _json(scene),
         "data": base64.b64encode(compressed(data, 1 if live else 6)).decode(),
-        "script": script("page", bool(live)),
+        "script": script("page", live),
     }
-    parts["policy"] = policy(f"\n{parts['script']}\n", bool(live))
+    parts["policy"] = policy(f"\n{parts['script']}\n", live)
     return re.sub(r"\{\{(\w+)\}\}", lambda found: parts[found[1]], source("page.html"))

@@ -35,6 +35,7 @@ from illumgrid.show.viewer.arrays import (
     reduced,
     thinned,
 )
+from illumgrid.show.viewer.texture import STEP, Coming
 from illumgrid.tone import WHITE, encode_srgb
 
 MOST_VOXELS = 2**25
@@ -88,7 +89,9 @@ def kept_apart(light: Illumination) -> dict[str, float]:
     return {name: float(light.weights.get(name, 1.0)) for name in light.lights} if apart else {}
 
 
-def _field(light: Illumination, number: int, stage: Stage, into: Bytes, notes: list[str]) -> dict[str, Any]:
+def _field(
+    light: Illumination, number: int, stage: Stage, into: Bytes, notes: list[str], coming: Coming | None
+) -> dict[str, Any]:
     field, whole, sky = light.scene.fields[number], light.grids[number], skies.sky_of(light)
     room = skies.room(light) if sky else np.inf
     most = min(MOST_NODES, int(min(1.0, room / (skies.FEWEST + skies.FINE)) * whole.support.size))
@@ -103,14 +106,17 @@ def _field(light: Illumination, number: int, stage: Stage, into: Bytes, notes: l
         notes.append(f"The light of {field.name}, whose level is held, is that of the middle of the sweep.")
     if clamped:
         notes.append(f"Values of {field.name} far outside the swept range were clamped for this page.")
-    texture = np.diag([*(1 / np.array(grid.spec.shape)), 1.0])
-    texture[:3, 3] = 0.5 / np.array(grid.spec.shape)
+    spec = coming.specs[number] if coming else grid.spec
+    texture = np.diag([*(1 / np.array(spec.shape)), 1.0])
+    texture[:3, 3] = 0.5 / np.array(spec.shape)
     material, through = field.material, displayed(light.scene).fields[number].material.transmission
     shown_albedo = displayed(light.scene).fields[number].material.albedo / max(1 - through, 1e-9)
     albedo = material.albedo
     error = np.where(np.isfinite(grid.bar), trust.relative(whole, grid.bar), HOLE)
     scale = light.exposure / np.pi
     shown = pack_light(_mix(grid.channels, grid.light) * scale, error, into)
+    if coming:
+        shown |= {"shape": list(spec.shape), "every": STEP}
     if kept_apart(light):
         layers = layers_of(light.scene)
         shown["layers"] = pack_layers(grid.light * scale, grid.channels, layers, shown["channels"], into)
@@ -138,7 +144,7 @@ def _field(light: Illumination, number: int, stage: Stage, into: Bytes, notes: l
         "light": shown,
         "caps": _caps(light, number),
         "toIndex": stage.to_index(volume).T.ravel().tolist(),
-        "toTexture": (texture @ stage.to_index(grid.spec)).T.ravel().tolist(),
+        "toTexture": (texture @ stage.to_index(spec)).T.ravel().tolist(),
     }
 
 
@@ -226,10 +232,11 @@ def _walls(light: Illumination, stage: Stage, into: Bytes) -> tuple[list[dict[st
     return described, atlas
 
 
-def _opening(scene: Scene, stage: Stage, up: str | None) -> dict[str, Any]:
+def opening(scene: Scene, up: str | None = None) -> dict[str, Any]:
     """The view of the still picture at the middle of the sweep, and the hull that it must hold."""
     from scipy.spatial import ConvexHull, QhullError
 
+    stage = Stage.of(scene)
     row = scene.levels(0.5)[0]
     right, front, upright = axes_of(scene.fields[0].volume.direction, up_of(scene) if up is None else up)
     forward = fit_camera(scene, row, 1.0, up=up).forward
@@ -268,11 +275,13 @@ def _tint(tint: Tint, stage: Stage, into: Bytes) -> dict[str, Any]:
     }
 
 
-def packed(light: Illumination, up: str | None = None, tint: Tint | None = None) -> tuple[dict[str, Any], bytes]:
-    """Description of a scene for the page, and the arrays that it points into; `up` as in `fit_camera`."""
+def packed(
+    light: Illumination, up: str | None = None, tint: Tint | None = None, coming: Coming | None = None
+) -> tuple[dict[str, Any], bytes]:
+    """Description of a scene for the page, and the arrays that it points into; see `illumgrid.show.viewer.page`."""
     scene, into = light.scene, Bytes()
     stage, notes = Stage.of(scene), list[str]()
-    fields = [_field(light, number, stage, into, notes) for number in range(len(scene.fields))]
+    fields = [_field(light, number, stage, into, notes, coming) for number in range(len(scene.fields))]
     walls, atlas = _walls(light, stage, into)
     lead = next((k for k, field in enumerate(scene.fields) if field.isovalue is None), 0)
     ranges = shown_range(scene.fields[lead].range, 6)
@@ -281,12 +290,13 @@ def packed(light: Illumination, up: str | None = None, tint: Tint | None = None)
     described = {
         "title": ", ".join(f.name for f in scene.fields),
         "subtitle": f"Global light from an illumination grid; {several}.",
-        "notes": [*notes, *(f"Error bars: {doubt}." for doubt in trust.doubts(light))],
+        "notes": [*notes, *(f"Error bars: {doubt}." for doubt in (() if coming else trust.doubts(light)))],
+        "live": coming.stamp if coming else 0,
         "axes": [
             axis.tolist() for axis in axes_of(scene.fields[0].volume.direction, up_of(scene) if up is None else up)
         ],
         "tangent": HALF_ANGLE,
-        "opening": _opening(scene, stage, up),
+        "opening": (coming and coming.opening) or opening(scene, up),
         "background": BACKGROUND,
         "capTone": CAP_TONE,
         "white": WHITE,

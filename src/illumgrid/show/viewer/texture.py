@@ -2,17 +2,31 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from illumgrid.field.volume import Floats
-from illumgrid.grid import fill_holes
+from illumgrid.grid import Channels, GridSpec, IlluminationGrid, fill_holes
 
 STEP = 4
 """Nodes from one of the coarse lattice to the next; as many on a side of a block, whose nodes are lit together."""
 SIDE = 16
 """Nodes on a side of the boxes in which light goes to the page."""
+
+
+@dataclass(frozen=True, eq=False)
+class Coming:
+    """Light that is still to come to a page: what is newer than `stamp`, at the nodes of `specs`, one lattice a field.
+
+    The page begins with the light of every `STEP`-th node along each axis, in straight lines between them, and with the
+    view `opening` of `illumgrid.show.viewer.packing`, if that is known already.
+    """
+
+    stamp: int
+    specs: Sequence[GridSpec]
+    opening: dict[str, Any] | None = None
 
 
 @dataclass(eq=False)
@@ -37,15 +51,27 @@ class Texture:
         at = np.unravel_index(flat, self.known.shape)
         self.stamps[tuple(index // SIDE for index in at)] = stamp
 
-    def fill(self, spacing: Floats, stamp: int) -> None:
-        """Give nodes without light that of the coarse lattice, in straight lines; what it lacks, it has from nearby."""
-        coarse = tuple(slice(None, None, STEP) for _ in range(3))
-        support = self.known[coarse].astype(np.float32)
+    def coarse(self, spacing: Floats) -> NDArray[np.float32]:
+        """Light of every node of the coarse lattice, so far apart; what it lacks, it has from nearby."""
+        every = tuple(slice(None, None, STEP) for _ in range(3))
+        support = self.known[every].astype(np.float32)
         if support.any():
-            even = fill_holes(spacing, self.light[coarse], support)
-        else:
-            some, shape = self.light[self.known], (*support.shape, self.light.shape[-1])
-            even = np.broadcast_to(some.mean(axis=0) if len(some) else np.float32(0), shape)
+            return fill_holes(spacing, self.light[every], support)
+        some, shape = self.light[self.known], (*support.shape, self.light.shape[-1])
+        return np.broadcast_to(some.mean(axis=0) if len(some) else np.float32(0), shape)
+
+    def every_fourth(self, spec: GridSpec, channels: Channels) -> IlluminationGrid:
+        """The coarse lattice of these nodes as a grid, whose errors are not known: at least two nodes along an axis."""
+        shape = np.maximum(2, -(-np.array(spec.shape) // STEP))
+        every = GridSpec(tuple(shape.tolist()), spec.origin, STEP * spec.spacing, spec.direction)
+        light, known = self.coarse(every.spacing), self.known[::STEP, ::STEP, ::STEP]
+        more = [(0, n - m) for n, m in zip(every.shape, known.shape)]
+        light, support = np.pad(light, [*more, (0, 0)], mode="edge"), np.pad(known, more).astype(np.float32)
+        return IlluminationGrid(every, light, np.full(every.shape, np.inf, np.float32), support, channels)
+
+    def fill(self, spacing: Floats, stamp: int) -> None:
+        """Give nodes without light that of the coarse lattice, in straight lines."""
+        even = self.coarse(spacing)
         for axis in (2, 1):
             even = np.moveaxis(np.tensordot(self._weights(axis), even, (1, axis)), 0, axis)
         even = np.ascontiguousarray(even)

@@ -1,6 +1,8 @@
 """The page in a notebook, by anywidget: Jupyter, VS Code, Colab."""
 
-from functools import cache
+import json
+from collections.abc import Callable
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -9,6 +11,7 @@ from illumgrid.errors import BadInput
 from illumgrid.light import Illumination
 from illumgrid.show.tints import Tint
 from illumgrid.show.viewer import compressed, script, shaders, source
+from illumgrid.show.viewer.texture import Coming
 
 
 @cache
@@ -25,7 +28,7 @@ def _widget_class() -> type[Any]:
     class View(anywidget.AnyWidget):  # type: ignore[misc, unused-ignore]
         """A lit scene; `isovalue`, of the first field, and `weights`, by light, follow the sliders and set them."""
 
-        _esm = script("widget")
+        _esm = script("widget", live=True)
         isovalue = traitlets.Float().tag(sync=True)
         range = traitlets.Tuple(traitlets.Float(), traitlets.Float(), read_only=True)
         lights = traitlets.Tuple(read_only=True)
@@ -56,29 +59,63 @@ def _widget_class() -> type[Any]:
 
 def widget(
     light: Illumination,
+    coming: Coming | None = None,
+    news: Callable[[str], bytes] | None = None,
+    *,
     isovalue: float | None = None,
     height: int = 520,
     up: str | None = None,
     tint: Tint | None = None,
 ) -> Any:
-    """A widget that shows `light`; see `Illumination.show`."""
-    import json
+    """A widget that shows `light`; see `Illumination.show`.
 
+    Where light is `coming`, its views ask for it by messages: `news` answers what is in the address of a page.
+    """
     view = _widget_class()
-    from illumgrid.show.viewer.packing import kept_apart, packed
+    from illumgrid.show.viewer.packing import kept_apart
 
-    scene, data = packed(light, up, tint)
-    low, high = map(float, light.scene.fields[scene["lead"]].range)
+    described = _described(light, up, tint, coming)
     made = view(
         height=height,
-        _scene=json.dumps(scene, allow_nan=False),
         _shaders=json.dumps(shaders()),
         _style=source("view.css"),
         _markup=source("view.html"),
-        _data=compressed(data),
+        **described,
     )
+    lead = next((field for field in light.scene.fields if field.isovalue is None), light.scene.fields[0])
+    low, high = map(float, lead.range)
     made.set_trait("range", (low, high))
     made.set_trait("lights", tuple(kept_apart(light)))
     made.weights = kept_apart(light)
     made.isovalue = (low + high) / 2 if isovalue is None else isovalue
+    if news:
+        made.on_msg(partial(_answer, news))
     return made
+
+
+def follow(made: Any, light: Illumination, up: str | None = None) -> None:
+    """Let views that are opened from now on show all light; those that are open have asked for it."""
+    from illumgrid.show.viewer.packing import kept_apart
+
+    with made.hold_sync():
+        for name, value in _described(light, up, None, None).items():
+            setattr(made, name, value)
+        made.set_trait("lights", tuple(kept_apart(light)))
+        made.weights = kept_apart(light)
+
+
+def _described(light: Illumination, up: str | None, tint: Tint | None, coming: Coming | None) -> dict[str, Any]:
+    from illumgrid.show.viewer.packing import packed
+
+    scene, data = packed(light, up, tint, coming)
+    return {"_scene": json.dumps(scene, allow_nan=False), "_data": compressed(data, 1 if coming else 6)}
+
+
+def _answer(news: Callable[[str], bytes], made: Any, asked: Any, buffers: Any) -> None:
+    """Send what is new to the view that asks; without a buffer where there is no light any more."""
+    try:
+        found = [news(str(asked["question"]))]
+    except Exception as problem:
+        made.send({"number": asked["number"], "problem": str(problem)})
+        return
+    made.send({"number": asked["number"]}, buffers=found)

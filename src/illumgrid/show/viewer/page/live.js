@@ -6,7 +6,7 @@ const PAUSE = 300; // milliseconds from an answer to the next question
 
 function asked(scene, state, since, aspect) {
   const slope = scene.tangent * Math.max(1, aspect), { forward } = facing(state.view, scene.axes);
-  return `light?since=${since}&sweep=${state.sweep}&eye=${eyeOf(state.view, scene.axes)}&forward=${forward}&slope=${slope}`;
+  return `since=${since}&sweep=${state.sweep}&eye=${eyeOf(state.view, scene.axes)}&forward=${forward}&slope=${slope}`;
 }
 
 // Half floats into a part of a texture of light.
@@ -30,16 +30,21 @@ export function taken(picture, scene, buffer) {
   return head;
 }
 
-// Asks until all light is there; `say` shows how far it is, `renew` draws what is new.
-export function live(picture, scene, state, aspect, say, renew) {
+// From the server of the page.
+async function fetched(question) {
+  const answer = await fetch(`light?${question}`);
+  if (!answer.ok) throw new Error(answer.status);
+  return answer.arrayBuffer();
+}
+
+// Asks until all light is there; `say` shows how far it is, `renew` draws what is new, `get` has the answer to a question.
+export function live(picture, scene, state, aspect, say, renew, get = fetched) {
   let since = scene.live;
   const ask = async () => {
-    const answer = await fetch(asked(scene, state, since, aspect()));
-    if (!answer.ok) throw new Error(answer.status);
-    const head = taken(picture, scene, await answer.arrayBuffer());
+    const head = taken(picture, scene, await get(asked(scene, state, since, aspect())));
     since = head.stamp;
     if (head.parts.length) renew();
-    say(head.done ? "All light is there. Reload the page for its error bars." : `${Math.floor(100 * head.share)} % of the light is there.`);
+    say(head.done ? `All light is there. ${get === fetched ? "Reload the page" : "Show it again"} for its error bars.` : `${Math.floor(100 * head.share)} % of the light is there.`);
     if (!head.done) setTimeout(again, PAUSE);
   };
   const again = () => ask().catch(() => say("The command that computes the light has ended; start it again to go on."));

@@ -14,8 +14,9 @@ const REST = 160; // milliseconds without a change until a full frame is drawn
 const SMOOTH = 30; // milliseconds per frame during interaction
 const QUICK = 60; // frames faster than this are refined beyond the four samples of a still picture
 
-// Runs the view in `root`, which holds the markup. Options: address (keep the state there), onChange (called with the state).
-export function view(root, scene, data, shaders, { address = true, onChange = () => {} } = {}) {
+// Runs the view in `root`, which holds the markup. Options: address (keep the state there), onChange (called with the state),
+// get (answers what is asked for light that is still to come).
+export function view(root, scene, data, shaders, { address = true, onChange = () => {}, get } = {}) {
   const part = (name) => root.querySelector(`[data-part="${name}"]`);
   const canvas = part("canvas"), stage = part("stage");
   const picture = new Picture(canvas, scene, data, shaders), resting = Resting.of(picture, shaders, data);
@@ -202,7 +203,7 @@ export function view(root, scene, data, shaders, { address = true, onChange = ()
     rests = false;
     draw();
   };
-  if (scene.live) live(picture, scene, state, aspect, (text) => { part("subtitle").textContent = text; }, renew);
+  if (scene.live) live(picture, scene, state, aspect, (text) => { part("subtitle").textContent = text; }, renew, get);
   return view_;
 }
 

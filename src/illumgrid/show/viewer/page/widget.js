@@ -4,7 +4,22 @@ import { inflate } from "./numbers.js";
 import { isovalueOf, lead, sweepOf } from "./state.js";
 import { complain, view } from "./view.js";
 
+// The kernel's answer to a question, by messages; `left` says whether the view is gone.
+const asking = (model, left) => (question) => new Promise((done, fail) => {
+  const number = Math.random();
+  const hear = (said, buffers) => {
+    if (said.number !== number) return;
+    model.off("msg:custom", hear);
+    const [held] = buffers ?? [];
+    if (held && !left()) done(held.buffer.slice(held.byteOffset, held.byteOffset + held.byteLength));
+    else fail(new Error(said.problem));
+  };
+  model.on("msg:custom", hear);
+  model.send({ number, question });
+});
+
 async function render({ model, el }) {
+  let gone = false;
   const place = document.createElement("div");
   place.style.cssText = `height: ${model.get("height")}px; container-type: inline-size`;
   el.append(place);
@@ -20,6 +35,7 @@ async function render({ model, el }) {
     const agree = (state) => near(model.get("isovalue"), isovalue(state.sweep)) && String(given()) === String(state.weights);
     const shown = view(root, scene, data, JSON.parse(model.get("_shaders")), {
       address: false,
+      get: asking(model, () => gone),
       onChange: (state) => {
         if (agree(state)) return;
         if (!near(model.get("isovalue"), isovalue(state.sweep))) model.set("isovalue", isovalue(state.sweep));
@@ -32,7 +48,10 @@ async function render({ model, el }) {
     };
     for (const trait of ["isovalue", "weights"]) model.on(`change:${trait}`, follow);
     follow();
-    return () => ["isovalue", "weights"].forEach((trait) => model.off(`change:${trait}`, follow));
+    return () => {
+      gone = true;
+      ["isovalue", "weights"].forEach((trait) => model.off(`change:${trait}`, follow));
+    };
   } catch (error) {
     complain(root, error.message);
   }
