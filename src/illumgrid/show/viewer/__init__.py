@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 MODULES = (
     "numbers",
+    "coarse",
     "camera",
     "state",
     "sweeps",
@@ -48,9 +49,9 @@ def source(name: str) -> str:
 def script(last: str, live: bool = False) -> str:
     """The modules and `last` joined into one: names are unique, so imports and exports are dropped, as comments are.
 
-    The module that asks for news of light is in `live` pages only.
+    What deals with light that is still to come is in `live` pages only.
     """
-    names = [name for name in MODULES if live or name != "live"]
+    names = [name for name in MODULES if live or name not in ("coarse", "live")]
     joined = "\n".join(source(f"{name}.js") for name in (*names, last))
     joined = re.sub(r"^(import | *//).*\n", "", joined, flags=re.MULTILINE)
     return re.sub(r"^export (?!default)", "", joined, flags=re.MULTILINE)

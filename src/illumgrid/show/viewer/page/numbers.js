@@ -36,13 +36,8 @@ export function fieldValues(bytes, about) {
   return values;
 }
 
-// Half floats: one channel of light or three, then the error; green and blue are differences to red. Of light that is
-// still to come there is `every` so many'th texel along each axis.
+// Half floats: one channel of light or three, then the error; green and blue are differences to red.
 export function lightTexels(bytes, about) {
-  if (about.every) {
-    const shape = about.shape.map((n) => Math.max(2, Math.ceil(n / about.every)));
-    return between(lightTexels(bytes, { ...about, shape, every: 0 }), about.channels + 1, shape, about.shape, about.every);
-  }
   const count = about.shape[0] * about.shape[1] * about.shape[2], each = about.channels + 1;
   const texels = new Uint16Array(each * count);
   for (let k = 0; k < each; k++) {
@@ -53,36 +48,10 @@ export function lightTexels(bytes, about) {
   return texels;
 }
 
-const HALVES = Float32Array.from({ length: 65536 }, (_, h) => {
+export const HALVES = Float32Array.from({ length: 65536 }, (_, h) => {
   const power = (h >> 10) & 31, size = power ? (1024 + (h & 1023)) * 2 ** (power - 25) : (h & 1023) * 2 ** -24;
   return h & 32768 ? -size : size;
 });
-
-// The other way, for numbers that a half float holds; those below the least normal one become 0.
-function halves(values) {
-  const bits = new Uint32Array(values.buffer), result = new Uint16Array(values.length);
-  for (let i = 0; i < bits.length; i++) {
-    const size = bits[i] & 0x7fffffff;
-    result[i] = ((bits[i] >>> 16) & 0x8000) | (size < 0x38800000 ? 0 : (size - 0x37fff000) >>> 13);
-  }
-  return result;
-}
-
-// From texels of a coarse lattice, of so many halves, to those of a fine one, in straight lines; beyond its last node, as there.
-function between(texels, each, coarse, fine, every) {
-  let values = Float32Array.from(texels, (h) => HALVES[h]), inner = each;
-  for (let axis = 0; axis < 3; axis++) {
-    const m = coarse[axis], n = fine[axis], outer = values.length / (inner * m), result = new Float32Array(outer * n * inner);
-    for (let o = 0; o < outer; o++) for (let i = 0; i < n; i++) {
-      const at = Math.min(i / every, m - 1), low = Math.floor(at), share = at - low;
-      const a = (o * m + low) * inner, b = (o * m + Math.min(low + 1, m - 1)) * inner, to = (o * n + i) * inner;
-      for (let j = 0; j < inner; j++) result[to + j] = values[a + j] * (1 - share) + values[b + j] * share;
-    }
-    values = result;
-    inner *= n;
-  }
-  return halves(values);
-}
 
 // Texels that are lit, where only those are held; else none.
 function litTexels(bytes, about, count) {

@@ -1,5 +1,6 @@
 // Draws one picture: layers of fields and walls, summed over places within the pixel, then shown.
 
+import { coarseTexels } from "./coarse.js";
 import { bricks, capLight, fieldValues, lightTexels, mixedTexels } from "./numbers.js";
 import { dot, eyeOf, facing, sum } from "./camera.js";
 import { skyTurned } from "./skies.js";
@@ -101,7 +102,7 @@ export class Picture {
 
   light(about, data) {
     const gl = this.gl, [format, layout] = about.channels === 1 ? [gl.RG16F, gl.RG] : [gl.RGBA16F, gl.RGBA];
-    return this.volume(format, layout, gl.HALF_FLOAT, about.shape, lightTexels(data, about), gl.LINEAR);
+    return this.volume(format, layout, gl.HALF_FLOAT, about.shape, about.every ? coarseTexels(data, about) : lightTexels(data, about), gl.LINEAR);
   }
 
   // Light of fields and walls under other weights, or the turned sky; until they change, it is the stored one.
