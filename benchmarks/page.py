@@ -1,7 +1,8 @@
 """Size of the interactive page for several volumes and grids, and time of a frame in a headless browser.
 
 ``python benchmarks/page.py [--repeats 15]`` needs Chromium and playwright. Frames are 320 x 240, drawn in software;
-global light, local light and no light take turns, so that a busy machine affects all alike; times are medians.
+global light, local light and no light take turns, so that a busy machine affects all alike; times are medians. So do
+frames under a sky that rests and under one that turns, for skies of degree 2 and 4.
 """
 
 import argparse
@@ -12,6 +13,8 @@ from pathlib import Path
 import numpy as np
 from playwright.sync_api import Browser, Page, sync_playwright
 
+from illumgrid.chain import run
+from illumgrid.field.layers import in_harmonics
 from illumgrid.field.scene import Scene, level_table
 from illumgrid.field.volume import Volume
 from illumgrid.grid import GridSpec, IlluminationGrid
@@ -24,6 +27,18 @@ FRAME = """(light) => {
   picture.sample({ ...state, light }, 320, 240, [0.5, 0.5], 0);
   picture.wait();
   return performance.now() - begun;
+}"""
+
+TURNED = """([turn, size]) => {
+  const { picture, put, state } = illumgrid, begun = performance.now();
+  put({ turn: [turn, turn / 4] });
+  const ball = performance.now() - begun;
+  picture.mix(state);
+  picture.wait();
+  const mixed = performance.now() - begun - ball;
+  picture.sample(state, ...size, [0.5, 0.5], 0);
+  picture.wait();
+  return [ball, mixed, performance.now() - begun];
 }"""
 
 
@@ -93,9 +108,29 @@ def frames(repeats: int) -> None:
         chromium.close()
 
 
+def turning(repeats: int) -> None:
+    """Frames while the hand turns the sky: the ball, the mixing of the light, and the whole frame."""
+    print("\ndegree  ball ms  mixing ms  frame ms: turning  resting")
+    with tempfile.TemporaryDirectory() as folder, sync_playwright() as playwright:
+        chromium = playwright.chromium.launch(executable_path="/usr/bin/chromium", args=ARGS)
+        for degree in (2, 4):
+            scene = in_harmonics(scene_of(128, True), degree)
+            light = run(scene, grid=96, paths=1, judge=False)
+            shown, _ = opened(chromium, folder, f"degree-{degree}", page(light))
+            took = [
+                [*shown.evaluate(TURNED, [5 * turn, [320, 240]]), shown.evaluate(FRAME, "global")]
+                for turn in range(1, repeats + 2)
+            ]
+            ball, mixed, frame, still = (statistics.median(column) for column in zip(*took[1:]))
+            print(f"{degree:6d} {ball:8.1f} {mixed:10.1f} {frame:18.1f} {still:8.1f}", flush=True)
+            shown.close()
+        chromium.close()
+
+
 if __name__ == "__main__":
     options = argparse.ArgumentParser()
     options.add_argument("--repeats", type=int, default=15)
     given = options.parse_args()
     sizes()
     frames(given.repeats)
+    turning(given.repeats)

@@ -28,13 +28,15 @@ MODULES = (
     "lights",
     "skies",
     "input",
+    "programs",
+    "mixture",
     "picture",
     "resting",
     "live",
     "view",
 )  # each imports from earlier
 SHADERS = (
-    "shared.glsl", "ray.vert", "march.glsl", "field.frag", "wall.vert", "wall.frag", "copy.frag",
+    "shared.glsl", "ray.vert", "march.glsl", "field.frag", "wall.vert", "wall.frag", "copy.frag", "mix.frag",
     "origin.frag", "origin_wall.frag", "gather.glsl", "gather_sky.frag", "gather.frag", "gather_wall.frag",
     "blend.frag", "rest.frag",
 )  # fmt: skip

@@ -53,36 +53,35 @@ export const HALVES = Float32Array.from({ length: 65536 }, (_, h) => {
   return h & 32768 ? -size : size;
 });
 
-// Texels that are lit, where only those are held; else none.
-function litTexels(bytes, about, count) {
-  if (about.mask === undefined) return null;
-  const lit = [];
-  for (let i = 0; i < count; i++) if ((bytes[about.mask + (i >> 3)] >> (i & 7)) & 1) lit.push(i);
-  return Uint32Array.from(lit);
+// Texels that hold the parts from which light is mixed: those that are lit, where only they are held, else all.
+export function heldTexels(bytes, about) {
+  const count = about.shape[0] * about.shape[1] * about.shape[2], held = [];
+  for (let i = 0; i < count; i++) if (about.mask === undefined || (bytes[about.mask + (i >> 3)] >> (i & 7)) & 1) held.push(i);
+  return held;
 }
 
-// The same texels in single precision, the light mixed from its layers, or from those of a sky with these coefficients:
-// their sum is clamped, after interpolation, and not each of them.
-export function mixedTexels(bytes, about, weights, sky) {
-  const count = about.shape[0] * about.shape[1] * about.shape[2], each = about.channels + 1;
-  const texels = new Float32Array(each * count);
-  const add = (offset, k, share, at = null) => {
-    const many = at ? at.length : count;
-    if (share) for (let i = 0; i < many; i++) texels[each * (at ? at[i] : i) + k] += share * HALVES[bytes[offset + i] | (bytes[offset + many + i] << 8)];
-  };
-  for (const { light, color, offset } of about.layers ?? []) color.forEach((share, k) => add(offset, k, share * weights[light]));
-  about.lit ??= litTexels(bytes, about, count);
-  for (const { color, basis, offset, scale } of sky ? about.sky : []) {
-    for (let k = 0; k < about.channels; k++) {
-      const share = basis ? basis.reduce((s, f, b) => s + f * sky[b][k], 0) : 1, many = about.lit?.length ?? count;
-      if (color >= 0 && color !== k) continue;
-      if (!scale) add(offset, k, share, about.lit);
-      else for (let i = 0; i < many; i++) texels[each * (about.lit ? about.lit[i] : i) + k] += share * scale * ((bytes[offset + i] << 24) >> 24);
+// The parts of which light is the weighted sum, as `mix.frag` takes them: a function of the weights of the lights and of
+// the coefficients of the sky to what each part adds to the channels, and one that puts its values into every fourth place of an array.
+export function lightParts(bytes, about, held) {
+  const { channels, shape } = about, count = shape[0] * shape[1] * shape[2], picked = about.mask === undefined ? null : held;
+  const halves = (offset, many, which) => (into, from) => {
+    for (let i = 0; i < held.length; i++) {
+      const at = offset + (which ? which[i] : i);
+      into[4 * i + from] = HALVES[bytes[at] | (bytes[at + many] << 8)];
     }
-  }
-  for (let i = 0; i < texels.length; i++) texels[i] = Math.max(-65504, Math.min(65504, texels[i]));
-  add(about.offset + 2 * count * about.channels, about.channels, 1); // the error, whose holes are negative
-  return texels;
+  };
+  const steps = (offset, scale) => (into, from) => {
+    for (let i = 0; i < held.length; i++) into[4 * i + from] = scale * ((bytes[offset + i] << 24) >> 24);
+  };
+  const shares = (of) => [0, 1, 2, 3].map((k) => (k < channels ? of(k) : 0));
+  const layers = (about.layers ?? []).map(({ light, color, offset }) => ({
+    shares: (weights) => shares((k) => color[k] * weights[light]), put: halves(offset, count, picked),
+  }));
+  const answers = (about.sky ?? []).map(({ color, basis, offset, scale }) => ({
+    shares: (_, sky) => shares((k) => (color >= 0 && color !== k ? 0 : basis ? basis.reduce((s, f, b) => s + f * sky[b][k], 0) : 1)),
+    put: scale ? steps(offset, scale) : halves(offset, held.length, null),
+  }));
+  return [...layers, ...answers];
 }
 
 // Exposed light of the faces of a field's box, 18 numbers, with its lights at these weights or under a sky with these coefficients.

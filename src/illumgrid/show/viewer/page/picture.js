@@ -1,48 +1,15 @@
 // Draws one picture: layers of fields and walls, summed over places within the pixel, then shown.
 
 import { coarseTexels } from "./coarse.js";
-import { bricks, capLight, fieldValues, lightTexels, mixedTexels } from "./numbers.js";
+import { bricks, capLight, fieldValues, lightTexels } from "./numbers.js";
 import { dot, eyeOf, facing, sum } from "./camera.js";
+import { Mixture } from "./mixture.js";
+import { program, set } from "./programs.js";
 import { skyTurned } from "./skies.js";
 import { DEFAULTS, isovalueOf } from "./state.js";
 
 export const LOOKS = ["matte", "shiny", "translucent"];
 const LAYERS = 4; // surfaces behind one another that a translucent look shows
-
-export function program(gl, vertex, fragment) {
-  const built = gl.createProgram();
-  const head = "#version 300 es\nprecision highp float;\nprecision highp int;\nprecision highp sampler3D;\nprecision highp usampler3D;\n";
-  for (const [kind, text] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]]) {
-    const shader = gl.createShader(kind);
-    gl.shaderSource(shader, head + text);
-    gl.compileShader(shader);
-    gl.attachShader(built, shader);
-  }
-  gl.linkProgram(built);
-  if (!gl.getProgramParameter(built, gl.LINK_STATUS) && !gl.isContextLost()) {
-    const logs = gl.getAttachedShaders(built).map((s) => gl.getShaderInfoLog(s));
-    throw new Error(`The graphics driver refused the page's shaders: ${logs.join(" ")} ${gl.getProgramInfoLog(built)}`);
-  }
-  const at = {};
-  for (let k = 0; k < gl.getProgramParameter(built, gl.ACTIVE_UNIFORMS); k++) {
-    const { name, type } = gl.getActiveUniform(built, k);
-    at[name] = { place: gl.getUniformLocation(built, name), type };
-  }
-  return { built, at };
-}
-
-export function set(gl, { at }, values) {
-  const how = {
-    [gl.FLOAT]: (p, v) => (v.length ? gl.uniform1fv(p, v) : gl.uniform1f(p, v)),
-    [gl.FLOAT_VEC2]: (p, v) => gl.uniform2fv(p, v),
-    [gl.FLOAT_VEC3]: (p, v) => gl.uniform3fv(p, v),
-    [gl.FLOAT_VEC4]: (p, v) => gl.uniform4fv(p, v),
-    [gl.FLOAT_MAT4]: (p, v) => gl.uniformMatrix4fv(p, false, v),
-  };
-  for (const [name, value] of Object.entries(values)) {
-    if (at[name]) (how[at[name].type] ?? ((p, v) => gl.uniform1i(p, v)))(at[name].place, value);
-  }
-}
 
 export class Picture {
   constructor(canvas, scene, data, shaders) {
@@ -65,6 +32,7 @@ export class Picture {
     this.fieldProgram = program(gl, shaders["ray.vert"], shaders["shared.glsl"] + shaders["march.glsl"] + shaders["field.frag"]);
     this.wallProgram = program(gl, shaders["wall.vert"], shaders["shared.glsl"] + shaders["wall.frag"]);
     this.copyProgram = program(gl, shaders["ray.vert"], shaders["copy.frag"]);
+    this.mixProgram = program(gl, shaders["ray.vert"], shaders["mix.frag"]);
     this.fields = scene.fields.map((field) => {
       const values = fieldValues(data, field.values);
       const held = bricks(values, field.values.shape);
@@ -109,12 +77,10 @@ export class Picture {
   mix({ weights, turn }) {
     if (!this.data || this.mixed === String([weights, turn])) return;
     this.mixed = String([weights, turn]);
-    const sky = this.turned = this.scene.sky && skyTurned(this.scene.sky.coefficients, turn);
-    const gl = this.gl, lit = this.scene.fields.map((field, k) => [this.fields[k].light, field.light]);
-    for (const [texture, about] of this.walls ? [...lit, [this.walls, this.scene.atlas]] : lit) {
-      gl.bindTexture(gl.TEXTURE_3D, texture);
-      gl.texSubImage3D(gl.TEXTURE_3D, 0, 0, 0, 0, ...about.shape, about.channels === 1 ? gl.RG : gl.RGBA, gl.FLOAT, mixedTexels(this.data, about, weights, sky));
-    }
+    this.turned = this.scene.sky && skyTurned(this.scene.sky.coefficients, turn);
+    this.mixtures ??= this.scene.fields.map((field, k) => new Mixture(this, field.light, this.fields[k].light))
+      .concat(this.walls ? [new Mixture(this, this.scene.atlas, this.walls)] : []);
+    for (const mixture of this.mixtures) mixture.draw(weights, this.turned);
   }
 
   // A place to draw into: colours of these formats, half floats as a rule, and a depth that can be read back.

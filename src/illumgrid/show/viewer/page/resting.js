@@ -3,7 +3,8 @@
 
 import { dot, sum } from "./camera.js";
 import { skyTexels } from "./numbers.js";
-import { LOOKS, program, set } from "./picture.js";
+import { LOOKS } from "./picture.js";
+import { program, set } from "./programs.js";
 import { skyTurned } from "./skies.js";
 
 export const PLACES = [[0.25, 0.25], [0.75, 0.75], [0.75, 0.25], [0.25, 0.75]].concat( // within the pixel, as in a still picture of the package, then between

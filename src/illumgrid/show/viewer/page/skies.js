@@ -60,7 +60,9 @@ export function skyBall(place, scene, get, put) {
     by(...step);
   });
   const ink = canvas.getContext("2d"), picture = ink.createImageData(BALL, BALL);
+  let shown = "";
   return (turn, view) => {
+    if (shown === (shown = JSON.stringify([turn, view]))) return;
     canvas.setAttribute("aria-valuenow", Math.round(turn[0]));
     const kept = skyTurned(scene.sky.coefficients, turn).map((c, b) => c.map((x) => x * COSINE[Math.floor(Math.sqrt(b))]));
     const { right, up, forward } = facing(view, scene.axes);
