@@ -103,6 +103,7 @@ def _volume(ending: str) -> Target:
         make,
         lambda file: read_volume(file.parent if file.suffix == ".dcm" else file),
         None if behind is None else lambda clean: clean.index(behind) + len(behind),
+        8 if ending == "h5" else 40,  # a process for each case
     )
 
 

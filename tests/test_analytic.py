@@ -22,10 +22,22 @@ def cases():
     return [make() for make in analytic.CASES]
 
 
+# Only here noise limits what is found. Elsewhere 2^18 paths, the default of `verify`, find the same bias as 2^20: the
+# bound of discretisation is larger, no path is off by more than rounding, or the cells of the box limit both (1.06 and
+# 1.02 %, 1.5 and 1.4). White furnaces find 0.06 % in place of 0.02, but test_theory asks each of their paths.
+NOISY = (
+    "within a film", "sealed furnace, glowing walls", "rectangular lamp", "floor beside a ball", "discs of the sky",
+)  # fmt: skip
+
+
 @pytest.mark.parametrize("name", verify.contenders())
 def test_a_backend_agrees_with_every_closed_form(name, cases):
-    paths = {"embree": 1 << 17, "reference": 1 << 17}.get(name, 1 << 20)
-    rows = list(check([name], paths=paths, seed=1, cases=cases))
+    least = 17 if name in ("embree", "reference") else 18
+    noisy = [case for case in cases if case.name in NOISY]
+    quiet = [case for case in cases if case.name not in NOISY]
+    assert len(noisy) == len(NOISY)
+    rows = list(check([name], paths=1 << least, seed=1, cases=quiet))
+    rows += check([name], paths=1 << (17 if least == 17 else 20), seed=1, cases=noisy)
     assert len(rows) == sum(not case.voxels or name in ("numba:levelset", "reference") for case in cases)
     assert all(row.agrees for row in rows), "\n".join(map(line, rows))
 

@@ -79,19 +79,18 @@ def test_a_kill_at_any_moment_leaves_a_whole_run_or_none(folder):
     begun = time.monotonic()
     assert start(*args, "first", cwd=folder).wait() == 0
     whole = time.monotonic() - begun
-    chance = random.Random(os.getpid())
-    for number in range(2):
-        moments = [whole * chance.uniform(0.4, 1.1) for _ in range(2)]
-        fresh = start(*args, f"out{number}", cwd=folder)
-        again = start(*args, "first", "--overwrite", "--seed", str(number + 1), cwd=folder)
-        begun = time.monotonic()
-        for moment, process in sorted(zip(moments, (fresh, again)), key=lambda pair: pair[0]):
-            time.sleep(max(0.0, begun + moment - time.monotonic()))
-            process.kill()
-            process.wait()
-        if (folder / f"out{number}").exists():
-            assert ig.load(folder / f"out{number}").recipe["seed"] == 0
-        assert ig.load(folder / "first").recipe["seed"] in range(number + 2)
+    chance = random.Random(os.getpid())  # other moments each time; benchmarks/kills.py tries more
+    moments = [whole * chance.uniform(0.4, 1.1) for _ in range(2)]
+    fresh = start(*args, "out", cwd=folder)
+    again = start(*args, "first", "--overwrite", "--seed", "1", cwd=folder)
+    begun = time.monotonic()
+    for moment, process in sorted(zip(moments, (fresh, again)), key=lambda pair: pair[0]):
+        time.sleep(max(0.0, begun + moment - time.monotonic()))
+        process.kill()
+        process.wait()
+    if (folder / "out").exists():
+        assert ig.load(folder / "out").recipe["seed"] == 0
+    assert ig.load(folder / "first").recipe["seed"] in (0, 1)
 
 
 @pytest.mark.parametrize("overwrite", [(), ("--overwrite",)])
