@@ -77,7 +77,7 @@ def fields():
 def truth_of(scene, error=0.002, levels=40, points=8000, bounces=32, paths=4096):
     asked = unseen_on_level_sets(scene, levels, points, 77)
     tracer = prepare(backend("numba"), scene)
-    return converge(begin(tracer, asked, bounces, 77), tracer, error, paths)
+    return converge(begin(tracer, asked, bounces, 77), error, paths)
 
 
 def off(light, truth):
@@ -217,7 +217,7 @@ def judgements(asked):
     scene = fields()["in the box"]
     tracer = prepare(backend("numba"), scene)
     light = run(scene, grid=40, paths=128, bounces=8, seed=0, judge=False)
-    exact = converge(begin(tracer, unseen_in_volume(scene, 2000, 50), 32, 50), tracer, 0.02, 256)
+    exact = converge(begin(tracer, unseen_in_volume(scene, 2000, 50), 32, 50), 0.02, 256)
     about = light.recipe["queries"], 128, 8
     reported = [judge(scene, tracer, light.grids, seed, *about) for seed in range(12)]
     rmse, true = [e.rmse for e in reported], off(light, exact).rmse

@@ -77,7 +77,7 @@ def reference(file, lit, limits, sigma, keep):
         asked = unseen_on_level_sets(scene, LEVELS, POINTS, SEED)
         bounces = enough(scene, tracer, 3e-4, SEED)
         exact = begin(tracer, asked, bounces, SEED)
-        exact = converge(exact, tracer, SHARP, MOST_PATHS if bounces <= 16 else MOST_PATHS // 4)
+        exact = converge(exact, SHARP, MOST_PATHS if bounces <= 16 else MOST_PATHS // 4)
         keep.mkdir(parents=True, exist_ok=True)
         np.savez(place, points=exact.queries.point, light=exact.light, off=exact.off)
     with np.load(place) as stored:

@@ -73,7 +73,7 @@ def measure(name, scene, longest, densities):
     from illumgrid.transport.tracer import prepare
 
     tracer = prepare(backend("numba"), scene)
-    reference = converge(begin(tracer, unseen_on_level_sets(scene, 40, 3000, 77), BOUNCES, 77), tracer, 0.006, 1024)
+    reference = converge(begin(tracer, unseen_on_level_sets(scene, 40, 3000, 77), BOUNCES, 77), 0.006, 1024)
     for nodes_along, paths in ((longest, 32), (longest, 8), (round(0.7 * longest), 8)):
         spec = GridSpec.over(scene.fields[0].volume, nodes_along)
         nodes = Nodes(spec, scene.fields[0])

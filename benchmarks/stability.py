@@ -86,7 +86,7 @@ def judged(scene: Scene, grids: dict[str, "ig.Illumination"]) -> dict[str, float
     """Relative RMSE of each method at points on isovalues that no method visited."""
     tracer = prepare(ig.backend("numba"), scene)
     asked = unseen_on_level_sets(scene, 10, 400, 7)
-    truth = converge(begin(tracer, asked, 3, 7), tracer, 0.005, 512)
+    truth = converge(begin(tracer, asked, 3, 7), 0.005, 512)
     return {name: errors(look_up(light.grids, truth.queries), truth).rmse for name, light in grids.items()}
 
 
@@ -135,7 +135,7 @@ def by_distance() -> Iterator[tuple[float, dict[str, float]]]:
 
         asked = join_queries(parts)
         asked = asked[np.flatnonzero(asked.normal.any(axis=1))]
-        truth = converge(begin(tracer, asked, 3, 7), tracer, 0.005, 512)
+        truth = converge(begin(tracer, asked, 3, 7), 0.005, 512)
         yield off, {n: errors(look_up(light.grids, truth.queries), truth).rmse for n, light in grids.items()}
 
 

@@ -65,7 +65,7 @@ def reference_of(one, other, bounces):
     one, other = (
         Bake((half.queries,), (1,), bounces, 0, (half,), (range(int(half.paths[0])),)) for half in (one, other)
     )
-    return Reference((one, other))
+    return Reference(prepare(BACKEND, sky()), (one, other))
 
 
 def test_unseen_points_lie_on_level_sets_of_the_range_evenly_in_isovalue_and_in_area():
@@ -270,7 +270,7 @@ def test_the_judgement_agrees_with_a_reference_on_level_sets():
     scene = FIELDS["labyrinth"]()
     tracer = prepare(BACKEND, scene)
     asked = unseen_on_level_sets(scene, 16, 1600, seed=50)
-    truth = converge(begin(tracer, asked, 16, seed=50), tracer, 0.01, 128)
+    truth = converge(begin(tracer, asked, 16, seed=50), 0.01, 128)
     light = run(scene, grid=14, paths=16, seed=0)
     found = judge(scene, tracer, light.grids, 0, 10**7, 16, 4)
     assert found.rmse == pytest.approx(off(light, truth), rel=0.2)

@@ -16,7 +16,7 @@ import pytest
 
 from illumgrid import registry, run
 from illumgrid.accuracy import chart as benches
-from illumgrid.accuracy import cost
+from illumgrid.accuracy import cost, reference
 from illumgrid.accuracy.chart import _references, _remarks, _show_default, _thinned, _tracer_of, bench, contestants
 from illumgrid.accuracy.chart import race as races
 from illumgrid.accuracy.chart import sizes as sizes_of
@@ -197,7 +197,7 @@ def test_a_budget_or_a_scene_that_cannot_be_is_refused():
 def ticking(monkeypatch):
     """A clock that goes on by a fixed step whenever it is read: no machine is too slow for a budget."""
     ticks = itertools.count(step=0.1)
-    for module in (benches, cost, contestants, races):
+    for module in (benches, cost, contestants, races, reference):
         monkeypatch.setattr(module, "time", SimpleNamespace(perf_counter=lambda: next(ticks)))
     monkeypatch.setattr(cost, "timeit", SimpleNamespace(repeat=lambda work, **_: [work() and 0.1]))
 

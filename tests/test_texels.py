@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import illumgrid as ig
+from illumgrid.accuracy.points import unseen_on_walls
 from illumgrid.accuracy.texels import texels_around, walls_for
-from illumgrid.accuracy.walls import unseen_on_walls
 from illumgrid.bake.walls import wall_queries
 from illumgrid.field.scene import finer_texels, level_table, with_texels
 from illumgrid.transport.samples import join_queries

@@ -5,7 +5,7 @@ import pytest
 
 import illumgrid as ig
 from illumgrid.accuracy.judge import judge_walls
-from illumgrid.accuracy.walls import unseen_on_walls
+from illumgrid.accuracy.points import unseen_on_walls
 from illumgrid.backends.numba_ import Numba
 from illumgrid.bake.walls import look_up_walls, place_on_walls, wall_queries
 from illumgrid.field.scene import Scene, level_table, with_texels

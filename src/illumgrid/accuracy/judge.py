@@ -6,10 +6,9 @@ from functools import partial
 
 import numpy as np
 
-from illumgrid.accuracy.points import unseen_in_volume
+from illumgrid.accuracy.points import unseen_in_volume, unseen_on_walls
 from illumgrid.accuracy.probe import Probe
 from illumgrid.accuracy.reference import Errors, Reference, begin, enough, errors, look_up
-from illumgrid.accuracy.walls import unseen_on_walls
 from illumgrid.bake.walls import look_up_walls
 from illumgrid.errors import BadInput
 from illumgrid.field.lattice import specs_over

@@ -59,7 +59,6 @@ class Probe:
     """Points of a scene at which light is known, to measure grids against."""
 
     scene: Scene
-    tracer: Tracer
     seed: int
     reference: Reference
     few: Reference  # some points with fewer paths: enough to see what bounces add, since both sides walk the same
@@ -75,15 +74,15 @@ class Probe:
         if not first.mean > 0:
             raise BadInput("no light reaches the surfaces of this scene; expected a background or a lamp that does")
         few = first[:: max(1, len(first) // 512)]
-        return cls(scene, tracer, seed, converge(first, tracer, error, most), few)
+        return cls(scene, seed, converge(first, error, most), few)
 
     def fewer(self, bounces: int) -> Reference:
         """The light at the points with fewer bounces, by the same paths."""
-        return self.reference.cut_off(self.tracer, bounces)
+        return self.reference.cut_off(bounces)
 
     def left_out(self, bounces: int) -> float:
         """Root mean square of the light that more bounces would add, relative."""
-        return float(np.sqrt((missing(self.few.cut_off(self.tracer, bounces), self.few) ** 2).mean()))
+        return float(np.sqrt((missing(self.few.cut_off(bounces), self.few) ** 2).mean()))
 
     def bounces_for(self, tolerance: float) -> int:
         """Fewest bounces that leave out less than a `tolerance`."""
@@ -92,11 +91,11 @@ class Probe:
 
     def measure(self, specs: Sequence[GridSpec], fewer: Reference, paths: int) -> Measured:
         """The error of grids with these lattices and the bounces of `fewer`, by `paths` paths from two seeds each."""
-        around = corners(self.scene, specs, self.reference.queries)
+        around, tracer = corners(self.scene, specs, self.reference.queries), self.reference.tracer
         seeds = self.seed, shifted_seed(self.seed, 2**62)
-        some = [Bake.of([around.asked], fewer.bounces, s).walk(self.tracer, range(paths // 4)) for s in seeds]
+        some = [Bake.of([around.asked], fewer.bounces, s).walk(tracer, range(paths // 4)) for s in seeds]
         found = []
-        for pair in (some, [bake.walk(self.tracer, range(paths // 4, paths)) for bake in some]):
+        for pair in (some, [bake.walk(tracer, range(paths // 4, paths)) for bake in some]):
             (one, covered), (other, _) = (around.read(bake.samples) for bake in pair)
             found.append(parts_of(one, other, covered, fewer, self.reference))
         falls = np.log(found[0].noise / found[1].noise) / np.log(4) if min(f.noise for f in found) > 0 else 1.0

@@ -1,5 +1,6 @@
 """Converged light at points that nobody asked for, and how far a grid is from it."""
 
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -26,6 +27,7 @@ class Reference:
     The error bars of the samples would not do: they are made to cover, and where light comes by few paths that is more.
     """
 
+    tracer: Tracer
     halves: tuple[Bake, Bake]  # of one batch of points each, without holes; as many paths in both
     surface: str = "levelset"  # that stands for the level sets: trilinear, or "mesh" (marching cubes)
 
@@ -76,16 +78,16 @@ class Reference:
         """Root mean square error of the reference itself, relative to the mean irradiance; 0 in the dark."""
         return float(np.sqrt((self.off**2).mean())) / self.mean if self.mean > 0 else 0.0
 
-    def walk(self, tracer: Tracer, paths: range) -> "Reference":
-        """Walk these paths as well, half of them with each seed; the limits are even."""
-        half = range(paths.start // 2, paths.stop // 2)
-        one, other = (h.walk(tracer, half) for h in self.halves)
+    def walk(self, paths: int) -> "Reference":
+        """Walk on to this even number of paths from each point, half of them with each seed."""
+        half = range(self.halves[0].paths, paths // 2)
+        one, other = (h.walk(self.tracer, half) for h in self.halves)
         return replace(self, halves=(one, other))
 
-    def cut_off(self, tracer: Tracer, bounces: int) -> "Reference":
+    def cut_off(self, bounces: int) -> "Reference":
         """The same paths, ended after fewer bounces."""
         one, other = (Bake.of(h.targets, min(bounces, self.bounces), h.seed) for h in self.halves)
-        return replace(self, halves=(one, other)).walk(tracer, range(self.paths))
+        return replace(self, halves=(one, other)).walk(self.paths)
 
 
 def enough(scene: Scene, tracer: Tracer, tolerance: float, seed: int) -> int:
@@ -99,14 +101,22 @@ def enough(scene: Scene, tracer: Tracer, tolerance: float, seed: int) -> int:
 def begin(tracer: Tracer, asked: Queries, bounces: int, seed: int, paths: int = 64) -> Reference:
     """Trace a few paths that no run of `seed` walks; points inside another field's solid are left out."""
     one, other = (Bake.of([asked], bounces, shifted_seed(other_paths(seed), k * 2**61)) for k in (0, 1))
-    found = Reference((one, other)).walk(tracer, range(paths))
+    found = Reference(tracer, (one, other)).walk(paths)
     return found[found.halves[0].samples.paths > 0]
 
 
-def converge(reference: Reference, tracer: Tracer, error: float, most: int = 1 << 14) -> Reference:
-    """Go on until the reference's own relative error is at most `error`, or `most` paths from each point are spent."""
+def converge(reference: Reference, error: float, most: int = 1 << 14, until: float = np.inf) -> Reference:
+    """Go on until its own relative error is at most `error`, `most` paths are walked, or twice as many take too long.
+
+    `until` is a time of `time.perf_counter`.
+    """
+    spent = 0.0
     while len(reference) and reference.error > error and reference.paths < most:
-        reference = reference.walk(tracer, range(reference.paths, 2 * reference.paths))
+        begun = time.perf_counter()
+        if begun + 2 * spent >= until:
+            break
+        reference = reference.walk(2 * reference.paths)
+        spent = time.perf_counter() - begun
     return reference
 
 

@@ -5,17 +5,19 @@ points are lit, and what they hold there is compared with the light at the point
 """
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
+from illumgrid.accuracy.parts import parts_of
+from illumgrid.accuracy.points import unseen_on_walls
 from illumgrid.accuracy.reference import begin
-from illumgrid.accuracy.walls import unseen_on_walls
 from illumgrid.bake.accumulator import Bake
 from illumgrid.bake.walls import at_texels, place_on_walls
 from illumgrid.field.scene import Levels, Scene, finer_texels
 from illumgrid.rng import shifted_seed
-from illumgrid.samplers.direct import Corners
-from illumgrid.transport.samples import Queries, join_queries
+from illumgrid.samplers.direct import Corners, Part
+from illumgrid.transport.samples import Queries
 from illumgrid.transport.tracer import Tracer
 
 FINER = (1.0, 2**0.5, 2.0, 8**0.5, 4.0)
@@ -28,19 +30,13 @@ GAIN = 0.9  # of the error of coarser texels, above which finer ones are not wor
 def texels_around(scene: Scene, levels: Levels, points: Queries) -> Corners:
     """The eight texels that a lookup at each of some points on walls reads."""
     quad, u, v, t = place_on_walls(scene, points)
-    texels = np.array([wall.texels for wall in scene.quads])[quad]
-    size = np.stack([np.full(len(quad), len(levels.table)), texels[:, 1], texels[:, 0]], axis=1)
-    place = np.stack([t * (size[:, 0] - 1), v * size[:, 1] - 0.5, u * size[:, 2] - 0.5], axis=1)
-    place = np.clip(place, 0, size - 1)
-    low = np.floor(place).astype(np.int64)
-    share, step = place - low, np.array(list(np.ndindex(2, 2, 2)))
-    corner = np.minimum(low[:, None] + step, size[:, None] - 1)
-    weight = np.where(step == 1, share[:, None], 1 - share[:, None]).prod(axis=2)
-    flat = (corner[..., 0] * size[:, None, 1] + corner[..., 1]) * size[:, None, 2] + corner[..., 2]
-    key, where = np.unique(flat | quad[:, None] << 40, return_inverse=True)
-    own, number = key & (1 << 40) - 1, key >> 40
-    asked = join_queries([at_texels(scene, levels, int(k), own[number == k]) for k in np.unique(number)])
-    return Corners(asked, where.reshape(weight.shape), weight, len(asked))
+
+    def part(number: int) -> Part:
+        own, (nu, nv), rows = np.flatnonzero(quad == number), scene.quads[number].texels, len(levels.table)
+        index = np.stack([t[own] * (rows - 1), v[own] * nv - 0.5, u[own] * nu - 0.5], axis=1)
+        return own, (rows, nv, nu), index, partial(at_texels, scene, levels, number)
+
+    return Corners.of(len(points), map(part, np.unique(quad).tolist()), 0)
 
 
 @dataclass(frozen=True)
@@ -64,13 +60,10 @@ def walls_for(scene: Scene, tracer: Tracer, levels: Levels, bounces: int, error:
     seeds, tried = (seed, shifted_seed(seed, 2**62)), list[Walls]()
     for finer in FINER:
         around = texels_around(finer_texels(scene, finer), levels, truth.queries)
-        one, other = (
-            around.read(Bake.of([around.asked], bounces, s).walk(tracer, range(PATHS)).samples)[0] - truth.light
-            for s in seeds
-        )
-        # The noise of the two cancels in their product; the reference's own is in both.
-        square = float((one * other).mean() - (truth.off**2).mean()) / truth.mean**2
-        off = float(np.sqrt(max(square, 0.0)))
+        bakes = (Bake.of([around.asked], bounces, s).walk(tracer, range(PATHS)) for s in seeds)
+        (one, covered), (other, _) = (around.read(bake.samples) for bake in bakes)
+        parts = parts_of(one, other, covered, truth, truth)
+        off = float(np.sqrt(max(parts.grid + parts.uncovered, 0.0)))
         tried.append(Walls(finer, off, off <= SHARE * error))
         if tried[-1].met:
             return tried[-1]

@@ -3,8 +3,9 @@
 Banks and Beason, "Decoupling illumination from isosurface generation using 4D light transport", TVCG 2009.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import ClassVar
 
 import numpy as np
@@ -19,6 +20,9 @@ from illumgrid.stages import Sampler, hookimpl
 from illumgrid.transport.samples import Queries, Samples, join_queries
 
 _BATCH = 1 << 14
+
+Part = tuple[NDArray[np.intp], tuple[int, ...], Floats, Callable[[NDArray[np.int64]], Queries]]
+"""Which points lie in a lattice, its shape, where (n, 3) they lie in it, and what asks at nodes by their numbers."""
 
 
 def at_nodes(scene: Scene, field: int, spec: GridSpec, nodes: NDArray[np.integer]) -> Queries:
@@ -124,12 +128,26 @@ class NodeQueries(Queries):
 
 @dataclass(frozen=True, eq=False)
 class Corners:
-    """The nodes that a lookup at some points reads, in a grid of `Direct` that is never built."""
+    """The nodes, or texels, that a lookup at some points reads, in light that is never computed as a whole."""
 
     asked: Queries  # one for each such node
     row: NDArray[np.int64]  # (n, 8): where in `asked` the nodes of each point are
     weight: Floats  # (n, 8): trilinear
-    nodes: int  # how many nodes the whole grid would have to light
+    nodes: int  # how many nodes the whole would have to light
+
+    @classmethod
+    def of(cls, points: int, parts: Iterable[Part], nodes: int) -> "Corners":
+        """Gather the nodes of so many points from parts: a lattice each, which some of the points lie in."""
+        row, weight = np.zeros((points, 8), np.int64), np.zeros((points, 8))
+        found, first = list[Queries](), 0
+        for own, shape, index, ask in parts:
+            around, share = zip(*corners_of(np.broadcast_to(0, shape), index))
+            flat = [np.ravel_multi_index(tuple(node.T), shape, mode="clip") for node in around]  # an axis may have one
+            unique, place = np.unique(np.stack(flat, axis=1), return_inverse=True)
+            row[own], weight[own] = first + place.reshape(-1, 8), np.stack(share, axis=1)
+            found.append(ask(unique))
+            first += len(unique)
+        return cls(join_queries(found), row, weight, nodes)
 
     def read(self, samples: Samples) -> tuple[Floats, NDArray[np.bool_]]:
         """Light (n, 3) at the points, and whether (n,) all of their nodes have light of their own.
@@ -145,18 +163,14 @@ class Corners:
 
 def corners(scene: Scene, specs: Sequence[GridSpec], points: Queries) -> Corners:
     """The nodes around the points of queries in grids with these lattices, one per field."""
-    row, weight = np.zeros((len(points), 8), np.int64), np.zeros((len(points), 8))
-    parts, first, nodes = [], 0, 0
-    for number, spec in enumerate(specs):
-        nodes += int(np.count_nonzero(reached(scene.fields[number], spec)))  # their numbers would take eight times more
+
+    def part(number: int, spec: GridSpec) -> Part:
         own = np.flatnonzero(points.target == number)
-        around, share = zip(*corners_of(spec, world_to_index(spec, points.point[own])))
-        flat = np.stack([np.ravel_multi_index(tuple(node.T), spec.shape) for node in around], axis=1)
-        unique, place = np.unique(flat, return_inverse=True)
-        row[own], weight[own] = first + place.reshape(flat.shape), np.stack(share, axis=1)
-        parts.append(at_nodes(scene, number, spec, unique))
-        first += len(unique)
-    return Corners(join_queries(parts), row, weight, nodes)
+        return own, spec.shape, world_to_index(spec, points.point[own]), partial(at_nodes, scene, number, spec)
+
+    # The numbers of the nodes to light would take eight times more than which they are.
+    nodes = sum(int(np.count_nonzero(reached(field, spec))) for field, spec in zip(scene.fields, specs))
+    return Corners.of(len(points), [part(number, spec) for number, spec in enumerate(specs)], nodes)
 
 
 @hookimpl

@@ -85,13 +85,12 @@ def bench(
     entrants, notes = tracers(scene, asked, budget)
     bounces = Probe.start(scene, auto, 256, 0.02, seed, 64).bounces_for(0.002)
     references, pace = _references(scene, entrants, asked, budget, seed, notes)
-    by_surface = {surface: _tracer_of(entrants, surface) for surface in references}
-    _sharpen(references, by_surface, dict.fromkeys(references, 4 * GOAL), 0.3 * REFERENCES * budget)
-    main, reference = next(iter(references.items()))
+    _sharpen(references, dict.fromkeys(references, 4 * GOAL), 0.3 * REFERENCES * budget)
+    reference = next(iter(references.values()))
     albedo = np.array([field.material.albedo for field in scene.fields])[reference.queries.target]
     exposure = tone.automatic_exposure(reference.light, albedo)
     paths = PICTURE * budget / pace
-    flip = studio(scene, by_surface[main], exposure, reference.bounces, seed, paths) if studio else None
+    flip = studio(scene, reference.tracer, exposure, reference.bounces, seed, paths) if studio else None
     able = methods([method for method in entrants if method.surface in references])
     race = Race(scene, references, able, sizes(scene), bounces, seed)
     notes += _show_default(race, *default, budget)
@@ -103,7 +102,7 @@ def bench(
     best = {
         s: min((p.rmse(r) for p in race.points if p.method.surface == s), default=1.0) for s, r in references.items()
     }
-    _sharpen(references, by_surface, {surface: error / 5 for surface, error in best.items()}, before_parts - report())
+    _sharpen(references, {surface: error / 5 for surface, error in best.items()}, before_parts - report())
     race.repeat(begun + before_parts, report, flip)  # what the references did not need goes into missing seeds
     parts = measure_parts(scene, auto, sizes(scene), bounces, seed, budget - report(), pace)
     shown = tuple(front(race.points, references))
@@ -163,21 +162,12 @@ def _thinned(reference: Reference, surface: str, spent: float, left: float, seed
     return replace(reference[chosen], surface=surface)
 
 
-def _sharpen(
-    references: dict[str, Reference], by_surface: dict[str, Tracer], error: dict[str, float], left: float
-) -> None:
+def _sharpen(references: dict[str, Reference], error: dict[str, float], left: float) -> None:
     """Walk more paths until the own errors are small enough or the time is over; the main reference comes last."""
     end = time.perf_counter() + left
-    for rest, (surface, reference) in zip(range(len(references), 0, -1), reversed(list(references.items()))):
-        spent, begun = 0.0, time.perf_counter()
-        until = begun + (end - begun) / rest
-        while reference.error > error[surface] and reference.paths < 1 << 15:
-            step = time.perf_counter()
-            if step + 2 * spent >= until:
-                break
-            reference = converge(reference, by_surface[surface], 0.0, 2 * reference.paths)
-            spent = time.perf_counter() - step
-        references[surface] = reference
+    for rest, surface in zip(range(len(references), 0, -1), reversed(list(references))):
+        now = time.perf_counter()
+        references[surface] = converge(references[surface], error[surface], 1 << 15, now + (end - now) / rest)
 
 
 def _show_default(race: Race, grid: int | None, paths: int, budget: float) -> list[str]:
