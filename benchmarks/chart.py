@@ -189,7 +189,7 @@ def break_even(asked):
         cases["stroke_T1, smoothed"] = Scene.sky(smooth(read_volume(place), 1.0), range=(60, 110))
     found = {}
     for name, scene in cases.items():
-        plan = planned(scene, prepare(backend("numba"), scene), level_table(scene, 4), error=0.03, bounces=BOUNCES)
+        plan, _ = planned(scene, prepare(backend("numba"), scene), level_table(scene, 4), error=0.03, bounces=BOUNCES)
         light, whole = timed(scene, judge=False, grid=plan.grid, paths=plan.paths, bounces=BOUNCES, isovalues=4)
         each, lookup = [], []
         for t in (0.2, 0.5, 0.8):

@@ -226,7 +226,7 @@ def test_the_probe_of_an_error_climbs_to_finer_grids_where_its_first_choice_will
         return measured(grid, 0.001 if first or grid >= 20 else 0.1, nodes=grid**3)
 
     monkeypatch.setattr(Probe, "measure", lucky)
-    plan = planned(scene, prepare(BACKEND, scene), level_table(scene, 4), error=0.02, seed=0)
+    plan, _ = planned(scene, prepare(BACKEND, scene), level_table(scene, 4), error=0.02, seed=0)
     assert plan.met and plan.grid >= 20
 
 
@@ -280,8 +280,8 @@ def test_the_judgement_agrees_with_a_reference_on_level_sets():
 def test_run_reports_what_it_chose_and_what_it_reached():
     scene = FIELDS["few bumps"]()
     recipe = run(scene, error=0.05, seed=0, judge=True).recipe
-    assert recipe["plan"]["met"] and recipe["grid"] == recipe["plan"]["grid"]
-    assert recipe["paths"] == recipe["plan"]["paths"] and len(recipe["plan"]["why"]) == 4
+    assert recipe["plan"]["met"] and recipe["plan"]["grid"] in (recipe["grid"], (recipe["refined"] or {}).get("from"))
+    assert recipe["paths"] == recipe["plan"]["paths"] and len(recipe["plan"]["why"]) >= 2
     assert recipe["reached"] <= 1.3 * 0.05
     kept = run(scene, seconds=1.0, grid=12, bounces=3, seed=0).recipe
     assert kept["grid"] == 12 and kept["bounces"] == 3

@@ -21,10 +21,10 @@ from illumgrid.accuracy.chart import _references, _remarks, _show_default, _thin
 from illumgrid.accuracy.chart import race as races
 from illumgrid.accuracy.chart import sizes as sizes_of
 from illumgrid.accuracy.chart.contestants import COUNTS, Method, methods, tracers
-from illumgrid.accuracy.chart.race import Point, Race, Run, covered, front
+from illumgrid.accuracy.chart.race import Point, Race, Run, front
 from illumgrid.accuracy.cost import Pace
 from illumgrid.accuracy.points import unseen_on_level_sets
-from illumgrid.accuracy.reference import begin, errors
+from illumgrid.accuracy.reference import begin, covered, errors, look_up
 from illumgrid.backends.numba_ import Numba
 from illumgrid.cli import report
 from illumgrid.cli.report import table
@@ -321,6 +321,40 @@ def test_a_default_that_is_too_costly_is_foreseen_and_so_are_its_neighbours(trut
     race = Race(scene, {"levelset": exact}, [METHOD], [5, 11, 22], 3, 0)
     assert not _show_default(race, 11, 32, 1e6)
     assert [(p.grid, p.paths, p.built) for p in race.points] == [(11, 32, True)]
+
+
+def test_runs_default_under_a_sky_races_with_its_first_look_and_its_command_line_gives_the_same_light():
+    scene = Scene.sky(ball(14), range=(0.4, 0.9))
+    tracer = prepare(BACKEND, scene)
+    exact = begin(tracer, unseen_on_level_sets(scene, 8, 200, 0), 8, 0, 256)
+    way = Method(Direct(), BACKEND, tracer, "levelset", (Nearest(),))
+
+    def race():
+        return Race(scene, {"levelset": exact}, [way], [6], 3, 5)
+
+    shown = race()
+    assert not _show_default(shown, None, None, 1e6)
+    (default,) = shown.points
+    assert default.default and default.built and default.method.looked
+    own = run(scene, isovalues=2, seed=5, judge=False)
+    assert default.paths == own.recipe["paths"] and default.queries == own.recipe["queries"]
+    np.testing.assert_array_equal(default.light[0], look_up(own.grids, exact.queries))
+    while contestant := shown.next(np.inf):
+        shown.advance(contestant)
+    more = next(p for p in shown.points if p.method.looked and p.paths == 128)
+    record = report.record(more, shown.references, True)
+    assert report.options(record, 3) == "--backend numba --paths 128" and "first look" in record["contestant"]
+    again = run(scene, backend="numba", paths=128, isovalues=2, seed=5, judge=False)
+    np.testing.assert_allclose(more.light[0], look_up(again.grids, exact.queries), rtol=1e-5)  # walked in two rounds
+    shown.repeat(np.inf, lambda: None)
+    assert "nearest was" not in str(report.advice([record | {"rmse": 0.001}], PARTS, 3))
+    assert "dominated" not in str(report.advice([record | {"rmse": 0.2}], PARTS, 3))
+    predicted, without = race(), race()
+    predicted.predict_looked(replace(default.method))
+    (seen,) = predicted.points
+    assert seen.default and not seen.built and seen.queries == default.queries
+    np.testing.assert_allclose(seen.light[0], default.light[0], rtol=1e-4)
+    assert "does not compete" in _show_default(without, None, None, 1e-9)[0] and not without.points
 
 
 def test_points_are_given_up_for_a_sharper_truth_where_light_is_rough(truth):

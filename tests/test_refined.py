@@ -2,13 +2,20 @@
 
 import itertools
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import illumgrid as ig
 from illumgrid import unfinished
+from illumgrid.accuracy import choose
+from illumgrid.accuracy.looked import Around, filled, looked
+from illumgrid.accuracy.points import unseen_in_volume
+from illumgrid.accuracy.probe import Probe
+from illumgrid.accuracy.reference import covered, look_up
 from illumgrid.backends.numba_ import Numba
+from illumgrid.bake.accumulator import Bake
 from illumgrid.bake.refined import MOST, Chosen, chosen, paths_for, read_choice, written
 from illumgrid.field.volume import interpolate, world_to_index
 from illumgrid.grid import GridSpec, IlluminationGrid, Nodes
@@ -171,7 +178,8 @@ def test_a_studio_is_lit_on_one_lattice_and_its_layers_keep_their_errors():
     assert np.isfinite(light.mix(key=1.5, dome=0.3).grids[0].error[known]).all()
 
 
-def test_a_refined_run_that_was_stopped_can_be_seen_and_goes_on_to_the_same_bits(call, monkeypatch, tmp_path):
+@pytest.mark.parametrize("planned", [False, True])
+def test_a_refined_run_that_was_stopped_can_be_seen_and_goes_on_to_the_same_bits(planned, call, monkeypatch, tmp_path):
     monkeypatch.setattr(walk, "PIECE", 2000)
     monkeypatch.setattr(walk, "GROWTH", 1.0)
     monkeypatch.setattr(partial, "EVERY", 0.0)
@@ -180,6 +188,12 @@ def test_a_refined_run_that_was_stopped_can_be_seen_and_goes_on_to_the_same_bits
     np.save(tmp_path / "shell.npy", shell().values)
     given = ("run", "shell.npy", "--scene", "sky", "--range", "0.2", "0.8", "--paths", "2", "--isovalues", "2",
              "--no-preview")  # fmt: skip
+    if planned:  # the first look has another number of nodes
+        scene = ig.Scene.sky(ig.read_volume(tmp_path / "shell.npy"), range=(0.2, 0.8))
+        ahead, _ = looked(scene, prepare(Numba(), scene), 11, None, 0)
+        plan = choose.Plan(11, 2, None, 0.1, 1.0, 0.0, 0.0, True, (), looked=True)
+        monkeypatch.setattr("illumgrid.chain.planned", lambda *_, **how: (plan, ahead))
+        given += ("--error", "0.1")
     call(*given, "-o", "whole")
     real, walked = walk.answer, itertools.count()
 
@@ -197,3 +211,40 @@ def test_a_refined_run_that_was_stopped_can_be_seen_and_goes_on_to_the_same_bits
     one, other = ig.load("whole").grids[0], ig.load("out").grids[0]
     np.testing.assert_array_equal(one.light, other.light)
     np.testing.assert_array_equal(one.error, other.error)
+
+
+# What is known of a refined run before it is lit.
+
+
+def test_the_nodes_around_points_hold_what_a_whole_run_has_there():
+    scene = sky(shell(25), (0.2, 0.8))
+    ahead, bounces = looked(scene, prepare(Numba(), scene), 17, None, 3)
+    asked = unseen_in_volume(scene, 12, 5)
+    around = Around(scene, ahead, asked)
+    assert ahead.refined["levels"] and len(around.asked) < 0.6 * around.nodes == 0.6 * len(ahead.sampler.nodes[0])
+    every = list(ahead.sampler.queries(scene, ahead.specs, 3))
+    grids = filled(scene, ahead, Bake.of(every, bounces, 3).walk(ahead.tracer, range(4)).answers)
+    light, whole = around.read(Bake.of([around.asked], bounces, 3).walk(ahead.tracer, range(4)).samples)
+    assert whole.all() and covered(grids, asked).all()
+    np.testing.assert_allclose(light, look_up(grids, asked), rtol=1e-5)
+
+
+def test_an_error_or_a_time_under_a_sky_may_be_reached_by_a_first_look(monkeypatch):
+    scene, real = sky(shell(25), (0.2, 0.8)), Probe.measure
+
+    def coarse(probe, specs, fewer, paths):
+        found = real(probe, specs, fewer, paths)
+        return replace(found, parts=replace(found.parts, grid=1.0))
+
+    monkeypatch.setattr(Probe, "measure", coarse)  # no lattice will do
+    met = ig.run(scene, error=0.05, isovalues=2, seed=1, judge=True).recipe
+    assert met["plan"]["looked"] and met["refined"]["from"] == met["plan"]["grid"] and met["cache"]
+    assert met["plan"]["met"] and met["reached"] < 1.3 * 0.05
+    with pytest.warns(ig.IllumgridWarning, match="out of reach"):
+        given = ig.run(scene, error=0.05, isovalues=2, seed=1, grid=20, judge=False).recipe
+    assert given["refined"] is None and not given["plan"]["looked"]  # nodes that are given are lit as a whole
+    own = ig.run(scene, seconds=1.5, bounces=3, isovalues=2, seed=1, judge=False).recipe
+    assert own["refined"] and own["bounces"] == 3 and not own["cache"]
+    monkeypatch.setattr(choose.Search, "_too_late", lambda *_: True)
+    with pytest.warns(ig.IllumgridWarning, match="too short"):
+        assert ig.run(scene, seconds=0.5, isovalues=2, judge=False).recipe["refined"] is None

@@ -17,7 +17,7 @@ from illumgrid.accuracy.judge import judge_walls as measure_walls
 from illumgrid.accuracy.probe import FEWEST_PATHS, MOST_PATHS
 from illumgrid.bake import Baked, bake
 from illumgrid.bake.accumulator import Map, Progress
-from illumgrid.bake.ahead import light_ahead
+from illumgrid.bake.ahead import Ahead, light_ahead, refinable_by
 from illumgrid.bake.bounces import enough_bounces, has_long_paths, light_left_out
 from illumgrid.constants import BASE, PATHS
 from illumgrid.errors import BadInput, tell, tell_after
@@ -130,24 +130,26 @@ def run(
     chosen = _stage("sampler", sampler, options), _stage("backend", backend), _stage("interpolator", interpolator)
     begun, tracer = time.perf_counter(), prepare(chosen[1], scene)
     before = None if keep is None else keep.chosen
+    at_once = bool(keep and keep.at_once)
     if error is not None or seconds is not None:
         _check_plannable(error, seconds, *chosen)
     cached, left_out = bool(before and before.get("cache")), 0.0
     plan: Any = None
+    ahead: Ahead | None = None
+    refinable = not at_once and grid is None and refinable_by(scene, *chosen)
     if before:
         grid, bounces, left_out, plan = (before[key] for key in ("grid", "bounces", "left_out", "plan"))
     elif error is not None or seconds is not None:
-        plan = _planned(
+        plan, ahead = _planned(
             scene, tracer, levels, progress, error=error, seconds=seconds, grid=grid, paths=paths, bounces=bounces,
-            texels=texels, seed=seed,
+            texels=texels, looking=refinable, seed=seed,
         )  # fmt: skip
         grid, bounces = plan["grid"], plan["bounces"]
     scene = finer_texels(scene, plan.get("finer", 1.0)) if plan else scene
     if not _shines(scene):
         tell("dark", "no background, lamp or surface of this scene emits light: all of it will be 0", stacklevel=2)
-    at_once = bool(keep and keep.at_once)
-    refining = before.get("refined") if before else not (at_once or grid or plan) and _refinable(scene, *chosen)
-    specs = specs_over(scene, None, BASE) if refining else specs_over(scene, grid)
+    refining = before.get("refined") if before else plan["looked"] if plan else refinable
+    specs = specs_over(scene, grid, BASE) if refining else specs_over(scene, grid)
     held = any(field.isovalue is not None for field in scene.fields)  # such rows are in no cache's sweep
     at_nodes = not held and (chosen[0].name, chosen[2].name) == ("direct", "nearest")
     density = getattr(chosen[2], "density", 1.0)
@@ -160,7 +162,7 @@ def run(
     elif not before:
         left_out = light_left_out(scene, tracer, bounces, seed)
     clock = time.perf_counter()
-    ahead = light_ahead(
+    ahead = ahead or light_ahead(
         scene, specs, levels, tracer, chosen, refining=bool(refining), cached=cached, automatic=automatic,
         bounces=bounces, seed=seed, map=map, progress=lambda what, done, total: progress("first light", done, total),
     )  # fmt: skip
@@ -202,14 +204,16 @@ def _longest(specs: Sequence[GridSpec]) -> int:
     return max(max(spec.shape) for spec in specs)
 
 
-def _planned(scene: Scene, tracer: Tracer, levels: Levels, progress: Progress, **asked: Any) -> dict[str, Any]:
-    """What a pilot chooses for an error or a time, as `Plan` has it; what the user should know is said."""
+def _planned(
+    scene: Scene, tracer: Tracer, levels: Levels, progress: Progress, **asked: Any
+) -> tuple[dict[str, Any], Ahead | None]:
+    """What a pilot chooses for an error or a time, as `planned` has it; what the user should know is said."""
     progress("pilot", 0, 1)
-    plan = planned(scene, tracer, levels, **asked)
+    plan, ahead = planned(scene, tracer, levels, **asked)
     progress("pilot", 1, 1)
     if plan.outlook:
         tell("plan", plan.outlook, stacklevel=3)
-    return asdict(plan)
+    return asdict(plan), ahead
 
 
 def _paths_of(
@@ -223,19 +227,6 @@ def _paths_of(
     if plan and seconds is not None and paths is None:
         return rounds(plan["paths"], plan["fill"], begun + seconds)
     return [range(plan["paths"] if plan else paths or few)]
-
-
-def _refinable(scene: Scene, sampler: Any, backend: Any, interpolator: Any) -> bool:
-    """Whether nodes can be lit where the light is rough: with the default stages, and isovalues that sweep together."""
-    can = capabilities(backend)
-    return (
-        len(layers_of(scene)) == 1  # in the studio, whose key casts sharp shadows, it gained little for more time
-        and not scene.quads
-        and (sampler.name, interpolator.name) == ("direct", "nearest")
-        and can.transport
-        and can.surface == "levelset"
-        and all(field.isovalue is None for field in scene.fields)
-    )
 
 
 def _whole_numbers(paths: Any, bounces: Any, seed: Any) -> tuple[int | None, int | None, int]:

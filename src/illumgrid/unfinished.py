@@ -64,7 +64,7 @@ def load(place: Path) -> tuple[Illumination, float]:
         specs = specs_over(scene, chosen["grid"])
         levels = level_table(scene, about["isovalues"] or 32)
         if refined := chosen.get("refined"):
-            base = specs_over(scene, None, BASE)
+            base = specs_over(scene, chosen["grid"], BASE)
             choice = read_choice(refined)
             specs = [finer(spec, choice.levels) for spec in base]
             sampler, interpolator = Chosen(choice.flat), Nested(choice.levels)

@@ -5,20 +5,24 @@ that point alone. The probe lights those for some points on grids of many sizes 
 points: that measures the error of a grid without building it.
 """
 
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from illumgrid.accuracy.cost import Pace
+from illumgrid.accuracy.looked import Around
 from illumgrid.accuracy.parts import Parts, missing, parts_of
 from illumgrid.accuracy.points import unseen_in_volume
 from illumgrid.accuracy.reference import Reference, begin, converge, enough
 from illumgrid.bake.accumulator import Bake
+from illumgrid.bake.ahead import Ahead
 from illumgrid.errors import BadInput
 from illumgrid.field.scene import Scene
 from illumgrid.grid import GridSpec
 from illumgrid.rng import shifted_seed
-from illumgrid.samplers.direct import corners
+from illumgrid.samplers.direct import Corners, corners
 from illumgrid.transport.tracer import Tracer
 
 FEWEST_PATHS, MOST_PATHS = 4, 1 << 16  # from each node of a planned run
@@ -34,6 +38,8 @@ class Measured:
     parts: Parts
     paths: int
     falls: float = 1.0  # the noise (squared) falls as paths to this power; more than 1 for well-spread paths
+    looked: bool = False  # whether these nodes are those of a first look, which chose the nodes to light
+    pace: Pace | None = None  # of its own, if other than that of lattices
 
     @property
     def floor(self) -> float:
@@ -92,12 +98,32 @@ class Probe:
     def measure(self, specs: Sequence[GridSpec], fewer: Reference, paths: int) -> Measured:
         """The error of grids with these lattices and the bounces of `fewer`, by `paths` paths from two seeds each."""
         around, tracer = corners(self.scene, specs, self.reference.queries), self.reference.tracer
-        seeds = self.seed, shifted_seed(self.seed, 2**62)
-        some = [Bake.of([around.asked], fewer.bounces, s).walk(tracer, range(paths // 4)) for s in seeds]
-        found = []
-        for pair in (some, [bake.walk(tracer, range(paths // 4, paths)) for bake in some]):
-            (one, covered), (other, _) = (around.read(bake.samples) for bake in pair)
-            found.append(parts_of(one, other, covered, fewer, self.reference))
-        falls = np.log(found[0].noise / found[1].noise) / np.log(4) if min(f.noise for f in found) > 0 else 1.0
+        some = self._walked(around, tracer, fewer.bounces, range(paths // 4))
+        first, last = (
+            self._parts(around, pair, fewer)
+            for pair in (some, [bake.walk(tracer, range(paths // 4, paths)) for bake in some])
+        )
+        falls = np.log(first.noise / last.noise) / np.log(4) if min(first.noise, last.noise) > 0 else 1.0
         grid = max(max(spec.shape) for spec in specs)
-        return Measured(grid, around.nodes, found[1], paths, float(np.clip(falls, 0.8, 1.6)))
+        return Measured(grid, around.nodes, last, paths, float(np.clip(falls, 0.8, 1.6)))
+
+    def measure_looked(self, longest: int, ahead: Ahead, bounces: int, fewer: Reference, paths: int) -> Measured:
+        """The error of a run whose nodes a first look at a lattice chose: see `measure`."""
+        clock = [time.perf_counter()]
+        around = Around(self.scene, ahead, self.reference.queries)
+        clock.append(time.perf_counter())
+        pair = self._walked(around, ahead.tracer, bounces, range(paths))
+        clock.append(time.perf_counter())
+        parts = self._parts(around, pair, fewer)
+        clock.append(time.perf_counter())
+        asking, walking, reading = np.diff(clock) / max(1, len(around.asked))
+        pace = Pace(asking + reading / 2, walking / (2 * paths))
+        return Measured(longest, around.nodes, parts, paths, looked=True, pace=pace)
+
+    def _walked(self, around: Corners | Around, tracer: Tracer, bounces: int, paths: range) -> list[Bake]:
+        seeds = self.seed, shifted_seed(self.seed, 2**62)
+        return [Bake.of([around.asked], bounces, seed).walk(tracer, paths) for seed in seeds]
+
+    def _parts(self, around: Corners | Around, pair: Sequence[Bake], fewer: Reference) -> Parts:
+        (one, covered), (other, _) = (around.read(bake.samples) for bake in pair)
+        return parts_of(one, other, covered, fewer, self.reference)

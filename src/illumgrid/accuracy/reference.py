@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from illumgrid.accuracy.points import other_paths
 from illumgrid.bake.accumulator import Bake
@@ -138,6 +139,15 @@ def look_up(grids: Sequence[IlluminationGrid], asked: Queries) -> Floats:
         own = asked.target == number
         light[own] = grid.lookup(asked.point[own])
     return light
+
+
+def covered(grids: Sequence[IlluminationGrid], asked: Queries) -> NDArray[np.bool_]:
+    """Points that read only nodes with light of their own."""
+    result = np.zeros(len(asked), bool)
+    for number, grid in enumerate(grids):
+        own = asked.target == number
+        result[own] = grid.covered(asked.point[own])
+    return result
 
 
 def errors(light: Floats, reference: Reference) -> Errors:

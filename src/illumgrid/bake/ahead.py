@@ -7,12 +7,14 @@ from typing import Any
 from illumgrid.bake.known import light_known_first
 from illumgrid.bake.refined import ROUGH, Chosen, chosen, paths_for, written
 from illumgrid.constants import PATHS
+from illumgrid.field.layers import layers_of
 from illumgrid.field.scene import Levels, Scene
 from illumgrid.grid import GridSpec
 from illumgrid.grid.cache import cache_of
 from illumgrid.grid.nested import finer, halvings
 from illumgrid.interpolators.nested import Nested
 from illumgrid.stages import Interpolator, Sampler
+from illumgrid.transport.stages import capabilities
 from illumgrid.transport.tracer import Tracer, ending_in
 
 
@@ -48,3 +50,16 @@ def light_ahead(
         [finer(spec, nodes.levels) for spec in specs], Chosen(nodes.flat), ending, Nested(nodes.levels),
         cached or in_look, written(nodes, specs), paths_for(nodes, specs), "look",
     )  # fmt: skip
+
+
+def refinable_by(scene: Scene, sampler: Any, backend: Any, interpolator: Any) -> bool:
+    """Whether nodes can be lit where the light is rough: with the default stages, and isovalues that sweep together."""
+    can = capabilities(backend)
+    return (
+        len(layers_of(scene)) == 1  # in the studio, whose key casts sharp shadows, it gained little for more time
+        and not scene.quads
+        and (sampler.name, interpolator.name) == ("direct", "nearest")
+        and can.transport
+        and can.surface == "levelset"
+        and all(field.isovalue is None for field in scene.fields)
+    )

@@ -38,7 +38,6 @@ def bench(
     from illumgrid.accuracy.chart import bench as race
     from illumgrid.cli.report import files
     from illumgrid.cli.scenes import scene_input
-    from illumgrid.constants import PATHS
     from illumgrid.io import disk
     from illumgrid.show.difference import studio
 
@@ -48,7 +47,7 @@ def bench(
     with reported_warnings():
         scene = given.make(smooth or 0.0)
         with progress_bars() as progress:
-            default = (given.preset.grid, given.preset.paths) if given.preset else (None, PATHS)
+            default = (given.preset.grid, given.preset.paths) if given.preset else (None, None)
             found = race(scene, budget, seed, progress, default, studio)
         content, text = files(found, given.name, scene)
     result(text)  # first: it stays where the files do not

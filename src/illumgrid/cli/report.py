@@ -86,11 +86,14 @@ def record(point: Point, references: dict[str, Reference], on_front: bool) -> Re
         "front": on_front,
         "default": point.default,
         "built": point.built,
+        "looked": method.looked,
     }
 
 
 def options(record: Record, bounces: int) -> str:
     """A setting as options of ``illumgrid run``."""
+    if record["looked"]:  # and as many bounces as it takes
+        return f"--backend {record['backend']} --paths {record['paths']}"
     words = [f"--{kind} {record[kind]}" for kind in ("sampler", "backend", "interpolator")]
     if count := record["options"]["sampler"].get("count"):
         words.append(f"--isovalues {count}")
@@ -110,10 +113,9 @@ def advice(records: Sequence[Record], parts: Sequence[Record], bounces: int) -> 
     last = best[-1]
     if missed := [f"{goal:.0%}" for goal in GOALS if goal < last["rmse"]]:
         were = "was" if len(missed) == 1 else "were"
-        found.append(
-            f"{' and '.join(missed)} {were} not reached within this budget; the nearest was {options(last, bounces)} "
-            f"({cost(last)}), whose error is dominated by {dominant(last, parts)}"
-        )
+        nearest = f"the nearest was {options(last, bounces)} ({cost(last)})"
+        why = "" if last["looked"] else f", whose error is dominated by {dominant(last, parts)}"
+        found.append(f"{' and '.join(missed)} {were} not reached within this budget; {nearest}{why}")
     return found
 
 

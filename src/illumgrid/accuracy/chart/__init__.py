@@ -14,12 +14,15 @@ from illumgrid.accuracy.points import unseen_on_level_sets
 from illumgrid.accuracy.probe import Measured, Probe
 from illumgrid.accuracy.reference import Reference, begin, converge, enough
 from illumgrid.bake.accumulator import Progress
+from illumgrid.bake.ahead import refinable_by
 from illumgrid.bake.bounces import light_left_out
-from illumgrid.constants import PATHS
+from illumgrid.bake.refined import LOOKED
+from illumgrid.constants import BASE, PATHS
 from illumgrid.errors import BadInput
 from illumgrid.field.lattice import specs_over
 from illumgrid.field.scene import Scene
 from illumgrid.grid.nodes import reachable
+from illumgrid.interpolators.nested import Nested
 from illumgrid.rng import shifted_seed
 from illumgrid.samplers.direct import Direct
 from illumgrid.transport.samples import Queries
@@ -62,13 +65,14 @@ def bench(
     budget: float = 120.0,
     seed: int = 0,
     progress: Progress = lambda what, done, total: None,
-    default: tuple[int | None, int] = (None, PATHS),
+    default: tuple[int | None, int | None] = (None, None),
     studio: Studio | None = None,
 ) -> Report:
     """Race all contestants on a scene for `budget` seconds, from warm kernels on.
 
-    `default` are the nodes and paths that are marked as the default of `run`; `studio` takes pictures, for the
-    difference that an eye would see. A budget that is not positive or a scene without surface or light raises BadInput.
+    `default` are the nodes and paths that are marked as the default of `run`, None where it chooses them; `studio`
+    takes pictures, for the difference that an eye would see. A budget that is not positive or a scene without surface
+    or light raises BadInput.
     """
     if not 0 < budget <= LONGEST:
         raise BadInput(f"a budget of {budget:g} seconds was asked for; expected up to {LONGEST:g}, such as 60")
@@ -170,7 +174,7 @@ def _sharpen(references: dict[str, Reference], error: dict[str, float], left: fl
         references[surface] = converge(references[surface], error[surface], 1 << 15, now + (end - now) / rest)
 
 
-def _show_default(race: Race, grid: int | None, paths: int, budget: float) -> list[str]:
+def _show_default(race: Race, grid: int | None, paths: int | None, budget: float) -> list[str]:
     """Chart `run`'s default; if it would take too much of the budget, predict it."""
     own = registry.auto_backend()
     entrants = [c.run.method for c in race.contestants if c.run.method.surface == "levelset"]
@@ -178,6 +182,9 @@ def _show_default(race: Race, grid: int | None, paths: int, budget: float) -> li
     nearest = next((i for i in method.interpolators if i.name == "nearest"), None) if method else None
     if method is None or nearest is None:
         return []
+    if grid is None and refinable_by(race.scene, method.sampler, method.backend, nearest):
+        return _show_looked(race, replace(method, interpolators=(Nested(),), denser=None, looked=True), budget)
+    paths = paths or PATHS
     shapes = {max(spec.shape) for spec in specs_over(race.scene, grid)}
     grid = shapes.pop() if len(shapes) == 1 else grid  # else fields of different size, each with its own default
     begun = time.perf_counter()
@@ -198,6 +205,21 @@ def _show_default(race: Race, grid: int | None, paths: int, budget: float) -> li
         will = SEEDS * count * pace.path * 8 * len(race.references["levelset"])
         if (size, count) != (grid, paths) and time.perf_counter() - begun + will < PREDICTED * budget:
             race.predict(method, nearest, size, count, takes)
+    return ["~ marks predicted times: only the nodes near reference points were computed"]
+
+
+def _show_looked(race: Race, method: Method, budget: float) -> list[str]:
+    """Chart `run`'s default where a first look chooses the nodes; predict it, or leave it out, if it is too costly."""
+    base = specs_over(race.scene, None, BASE)
+    pace = measure_pace(race.scene, method.tracer, base, 16, race.bounces, race.seed)
+    nodes = sum(len(reachable(field, spec)) for field, spec in zip(race.scene.fields, base))
+    look = pace.seconds(nodes, 2 * LOOKED)  # of twice the bounces
+    if 3 * look <= DEFAULT * budget:  # the nodes that it chooses have as many paths and more to fill
+        race.show_default(method, method.interpolators[0], None, None)
+        return []
+    if look > DEFAULT * budget:
+        return [f"run's default does not compete: its first look would take about {look:.0f} s"]
+    race.predict_looked(method)
     return ["~ marks predicted times: only the nodes near reference points were computed"]
 
 

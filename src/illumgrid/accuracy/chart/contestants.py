@@ -29,12 +29,14 @@ class Method:
     denser: "Method | None" = None  # the same with more level sets, tried after this one
     slow: float = 1.0  # what the backend takes, over what the fastest one takes
     own: bool = True  # whether the backend is of this package and not a plugin's
+    looked: bool = False  # whether a first look chooses the nodes, as `run` does under a sky
 
     def label(self, interpolator: Interpolator) -> str:
         """Name of a contestant, as the chart shows it."""
         count = getattr(self.sampler, "count", None)
         sampler = self.sampler.name if count is None else f"{self.sampler.name} {count}"
         surface = f" ({self.surface})" if hasattr(self.backend, "surface") else ""
+        sampler = "first look" if self.looked else sampler
         return f"{sampler}, {self.backend.name}{surface}, {interpolator.name}"
 
 

@@ -1,7 +1,7 @@
 """The race: error and seconds of every method, the cheapest and most promising first, within a budget."""
 
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -9,9 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from illumgrid.accuracy.chart.contestants import COUNTS, Method
-from illumgrid.accuracy.reference import Reference, errors, look_up
+from illumgrid.accuracy.looked import Around, looked
+from illumgrid.accuracy.reference import Reference, covered, errors, look_up
 from illumgrid.bake.accumulator import Bake
+from illumgrid.bake.ahead import Ahead
 from illumgrid.bake.targets import of_field
+from illumgrid.constants import BASE, DENSITY, PATHS
 from illumgrid.errors import BadInput
 from illumgrid.field.lattice import specs_over
 from illumgrid.field.scene import Scene
@@ -20,7 +23,6 @@ from illumgrid.grid import GridSpec, IlluminationGrid, Nodes
 from illumgrid.rng import shifted_seed
 from illumgrid.samplers.direct import corners
 from illumgrid.stages import Interpolator
-from illumgrid.transport.samples import Queries
 from illumgrid.transport.stages import fill_nodes
 
 STEPS = (8, 32, 128, 512, 2048)  # paths; `run`'s default is one of them
@@ -63,41 +65,38 @@ class Run:
 
     def __init__(self, scene: Scene, method: Method, grid: int | None, bounces: int, seed: int) -> None:
         self.scene, self.method, self.grid, self.seed = scene, method, grid, seed
-        self.specs: list[GridSpec] = specs_over(scene, grid)
+        self.specs: Sequence[GridSpec] = specs_over(scene, grid, BASE if method.looked else DENSITY)
         self.longest = max(max(spec.shape) for spec in self.specs)
         self.bake = Bake.of([], bounces, seed)
+        self.ahead: Ahead | None = None
         self.asking = self.tracing = 0.0
 
-    def go_on(self, paths: int) -> None:
-        """Trace until each query has so many paths."""
-        if paths <= self.bake.paths:
-            return
+    def go_on(self, paths: int | None) -> None:
+        """Trace until each query has so many paths, by default as many as `run` takes after a first look."""
         begun = time.perf_counter()
         if not self.bake.targets:
-            asked = [q for q in self.method.sampler.queries(self.scene, self.specs, self.seed) if len(q)]
-            self.bake = Bake.of(asked, self.bake.bounces, self.seed)
+            sampler, bounces = self.method.sampler, self.bake.bounces
+            if self.method.looked:
+                self.ahead, bounces = looked(self.scene, self.method.tracer, self.grid, None, self.seed)
+                self.specs, sampler = self.ahead.specs, self.ahead.sampler
+            asked = [q for q in sampler.queries(self.scene, self.specs, self.seed) if len(q)]
+            self.bake = Bake.of(asked, bounces, self.seed)
             self.asking = time.perf_counter() - begun
             begun = time.perf_counter()
-        self.bake = self.bake.walk(self.method.tracer, range(self.bake.paths, paths))
-        self.tracing += time.perf_counter() - begun
+        paths = paths or (self.ahead.paths if self.ahead else PATHS)
+        if paths > self.bake.paths:
+            tracer = self.ahead.tracer if self.ahead else self.method.tracer
+            self.bake = self.bake.walk(tracer, range(self.bake.paths, paths))
+            self.tracing += time.perf_counter() - begun
 
     def fill(self, interpolator: Interpolator) -> tuple[list[IlluminationGrid], float]:
         """Grids from the samples so far, and the seconds that this took, all in all."""
         begun = time.perf_counter()
-        grids = []
+        grids, interpolator = [], self.ahead.interpolator if self.ahead else interpolator
         for number, spec in enumerate(self.specs):
             own = of_field(self.scene, self.bake.answers, number)
             grids.append(fill_nodes(interpolator, own, Nodes(spec, self.scene.fields[number], number)))
         return grids, self.asking + self.tracing + time.perf_counter() - begun
-
-
-def covered(grids: list[IlluminationGrid], asked: Queries) -> NDArray[np.bool_]:
-    """Points that read only nodes with light of their own."""
-    result = np.zeros(len(asked), bool)
-    for number, grid in enumerate(grids):
-        own = asked.target == number
-        result[own] = grid.covered(asked.point[own])
-    return result
 
 
 def front(points: Iterable[Point], references: dict[str, Reference]) -> list[Point]:
@@ -156,16 +155,16 @@ class Race:
     def _run(self, method: Method, grid: int | None, again: int = 0) -> Run:
         return Run(self.scene, method, grid, self.bounces, shifted_seed(self.seed, again))
 
-    def show_default(self, method: Method, nearest: Interpolator, grid: int | None, paths: int) -> None:
+    def show_default(self, method: Method, nearest: Interpolator, grid: int | None, paths: int | None) -> None:
         """Chart what `run` does when nothing is asked for, before all others; its contestant goes on from there."""
         run = self._run(method, grid)
         run.go_on(paths)
         point, _ = self._point(run, nearest)
         point.default = True
         self.points.append(point)
-        step = sum(fewer < paths for fewer in STEPS)
+        step = sum(fewer < point.paths for fewer in STEPS)
         if step < len(STEPS):
-            cost = point.time - run.tracing + run.tracing * (STEPS[step] / paths - 1)
+            cost = point.time - run.tracing + run.tracing * (STEPS[step] / point.paths - 1)
             first = grid in self.sizes
             self.contestants.append(Contestant(run, method.interpolators, step, cost, (point,), first=first))
 
@@ -180,6 +179,22 @@ class Race:
         longest = max(max(spec.shape) for spec in specs)
         point = Point(method, nearest, grid, paths, around.nodes, found[0][1], longest, default=default, built=False)
         point.seconds, point.light = [takes] * len(found), [light for light, _ in found]
+        self.points.append(point)
+
+    def predict_looked(self, method: Method) -> None:
+        """Chart what `run` does after a first look, by the nodes around the points; the look is as in the run."""
+        (filler,), surface = method.interpolators, method.surface
+        scene, begun = self.scene, time.perf_counter()
+        ahead, bounces = looked(scene, method.tracer, None, None, self.seed)
+        look, reference = time.perf_counter() - begun, self.references[surface]
+        around = Around(scene, ahead, reference.queries)
+        walk = time.perf_counter()
+        bake = Bake.of([around.asked], bounces, self.seed).walk(ahead.tracer, range(ahead.paths))
+        light, read = around.read(bake.samples)
+        takes = look + (time.perf_counter() - walk) * around.nodes / len(around.asked)
+        longest = max(max(spec.shape) for spec in specs_over(scene, None, BASE))
+        point = Point(method, filler, None, ahead.paths, around.nodes, read, longest, default=True, built=False)
+        point.seconds, point.light = [takes], [light]
         self.points.append(point)
 
     def advance(self, contestant: Contestant) -> None:
