@@ -243,7 +243,7 @@ def test_an_error_or_a_time_under_a_sky_may_be_reached_by_a_first_look(monkeypat
     with pytest.warns(ig.IllumgridWarning, match="out of reach"):
         given = ig.run(scene, error=0.05, isovalues=2, seed=1, grid=20, judge=False).recipe
     assert given["refined"] is None and not given["plan"]["looked"]  # nodes that are given are lit as a whole
-    own = ig.run(scene, seconds=1.5, bounces=3, isovalues=2, seed=1, judge=False).recipe
+    own = ig.run(scene, error=0.08, bounces=3, isovalues=2, seed=1, judge=False).recipe
     assert own["refined"] and own["bounces"] == 3 and not own["cache"]
     monkeypatch.setattr(choose.Search, "_too_late", lambda *_: True)
     with pytest.warns(ig.IllumgridWarning, match="too short"):

@@ -182,7 +182,7 @@ def _show_default(race: Race, grid: int | None, paths: int | None, budget: float
     nearest = next((i for i in method.interpolators if i.name == "nearest"), None) if method else None
     if method is None or nearest is None:
         return []
-    if grid is None and refinable_by(race.scene, method.sampler, method.backend, nearest):
+    if grid is None and paths is None and refinable_by(race.scene, method.sampler, method.backend, nearest):
         return _show_looked(race, replace(method, interpolators=(Nested(),), denser=None, looked=True), budget)
     paths = paths or PATHS
     shapes = {max(spec.shape) for spec in specs_over(race.scene, grid)}
