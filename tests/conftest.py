@@ -7,7 +7,9 @@ import os
 import signal
 import sys
 import time
+from collections import Counter
 
+import numba
 import numpy as np
 import pytest
 import typer
@@ -30,29 +32,30 @@ os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False
 
 
-def uncounted(work):
-    """The same function without the trace of coverage (not that of a debugger), which doubles the time it takes."""
-
-    @functools.wraps(work)
-    def quick(*args, **options):
-        if not type(trace := sys.gettrace()).__module__.startswith("coverage"):
-            return work(*args, **options)
+@contextlib.contextmanager
+def uncounted():
+    """Without the trace of coverage, which doubles the time of plain Python; that of a debugger stays."""
+    trace = sys.gettrace()
+    counted = type(trace).__module__.startswith("coverage")
+    if counted:
         sys.settrace(None)
-        try:
-            return work(*args, **options)
-        finally:
+    try:
+        yield
+    finally:
+        if counted:
             sys.settrace(trace)
-
-    return quick
 
 
 # What is not ours to count: Numba's compiler, a third of the suite's time with coverage, and the loops of the oracle.
-Dispatcher.compile = uncounted(Dispatcher.compile)
+Dispatcher.compile = uncounted()(Dispatcher.compile)
 for loops in ("path_worth", "is_hole", "solve"):
-    setattr(naive, loops, uncounted(getattr(naive, loops)))
+    setattr(naive, loops, uncounted()(getattr(naive, loops)))
 
 # Typer makes all commands anew for each call, which takes longer than most of what 2,000 calls below ask for.
 typer.main.get_command = functools.cache(typer.main.get_command)
+
+# Only a power cut could tell whether what is written is on the disk: test_disk watches the calls.
+os.fsync = lambda handle: None
 
 # A judgement takes longer than the runs of most tests: those that are about it ask for it, or have the mark `judged`.
 chain.run.__kwdefaults__["judge"] = False
@@ -61,6 +64,18 @@ chain.run.__kwdefaults__["judge"] = False
 for stop, action in (("SIGINT", signal.default_int_handler), ("SIGHUP", signal.SIG_DFL)):
     if hasattr(signal, stop) and signal.getsignal(getattr(signal, stop)) is signal.SIG_IGN:
         signal.signal(getattr(signal, stop), action)
+
+
+_cases: Counter = Counter()
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_pyfunc_call(pyfuncitem):
+    """Coverage counts only the first cases of a test whose cases are `alike`; all where kernels are plain Python."""
+    _cases[name := pyfuncitem.nodeid.partition("[")[0]] += 1
+    known = _cases[name] > 4 and pyfuncitem.get_closest_marker("alike") and not numba.config.DISABLE_JIT
+    with uncounted() if known else contextlib.nullcontext():
+        return (yield)
 
 
 @pytest.fixture

@@ -40,6 +40,7 @@ SCENES = {
 }
 
 
+@pytest.mark.alike
 @pytest.mark.plain
 @pytest.mark.parametrize("name", SCENES)
 @pytest.mark.parametrize("known", [False, True])
