@@ -81,7 +81,7 @@ def truth_of(scene, error=0.002, levels=40, points=8000, bounces=32, paths=4096)
 
 
 def off(light, truth):
-    return errors(look_up(light.grids, truth.queries), truth)
+    return errors(look_up(light.grids, truth.queries)[0], truth)
 
 
 def timed(scene, **options):

@@ -67,7 +67,8 @@ def reference(file, lit, limits, sigma, keep):
     if not place.exists():
         from illumgrid import Scene, backend, read_volume
         from illumgrid.accuracy.points import unseen_on_level_sets
-        from illumgrid.accuracy.reference import begin, converge, enough
+        from illumgrid.accuracy.reference import begin, converge
+        from illumgrid.bake.bounces import enough_bounces
         from illumgrid.field.volume import smooth
         from illumgrid.transport.tracer import prepare
 
@@ -75,7 +76,7 @@ def reference(file, lit, limits, sigma, keep):
         scene = getattr(Scene, lit)(smooth(volume, sigma) if sigma else volume, range=limits)
         tracer = prepare(backend("numba"), scene)
         asked = unseen_on_level_sets(scene, LEVELS, POINTS, SEED)
-        bounces = enough(scene, tracer, 3e-4, SEED)
+        bounces, _ = enough_bounces(scene, tracer, SEED, 3e-4)
         exact = begin(tracer, asked, bounces, SEED)
         exact = converge(exact, SHARP, MOST_PATHS if bounces <= 16 else MOST_PATHS // 4)
         keep.mkdir(parents=True, exist_ok=True)

@@ -51,7 +51,7 @@ def measured(grid, reference):
     from illumgrid.accuracy.reference import errors, look_up
 
     points = reference.queries.point
-    e = errors(look_up([grid], reference.queries), reference)
+    e = errors(look_up([grid], reference.queries)[0], reference)
     off = np.sqrt(((grid.lookup(points) - reference.light) ** 2).mean(axis=1))
     bar = np.hypot(grid.uncertainty(points), np.sqrt((reference.off**2).mean(axis=1)))
     known = np.isfinite(bar)

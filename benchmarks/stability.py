@@ -87,7 +87,7 @@ def judged(scene: Scene, grids: dict[str, "ig.Illumination"]) -> dict[str, float
     tracer = prepare(ig.backend("numba"), scene)
     asked = unseen_on_level_sets(scene, 10, 400, 7)
     truth = converge(begin(tracer, asked, 3, 7), 0.005, 512)
-    return {name: errors(look_up(light.grids, truth.queries), truth).rmse for name, light in grids.items()}
+    return {name: errors(look_up(light.grids, truth.queries)[0], truth).rmse for name, light in grids.items()}
 
 
 def swept(values: list[float], make: Callable[[float], Scene]) -> Iterator[tuple[float, dict[str, float]]]:
@@ -136,7 +136,7 @@ def by_distance() -> Iterator[tuple[float, dict[str, float]]]:
         asked = join_queries(parts)
         asked = asked[np.flatnonzero(asked.normal.any(axis=1))]
         truth = converge(begin(tracer, asked, 3, 7), 0.005, 512)
-        yield off, {n: errors(look_up(light.grids, truth.queries), truth).rmse for n, light in grids.items()}
+        yield off, {n: errors(look_up(light.grids, truth.queries)[0], truth).rmse for n, light in grids.items()}
 
 
 CURVES: dict[str, tuple[str, Callable[[], Iterator[tuple[float, dict[str, float]]]]]] = {

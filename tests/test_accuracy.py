@@ -7,10 +7,9 @@ from illumgrid import run
 from illumgrid.accuracy.choose import Goal, Plan, choose, outlook, planned, sizes
 from illumgrid.accuracy.cost import Pace
 from illumgrid.accuracy.judge import judge
-from illumgrid.accuracy.parts import Parts, parts_of
 from illumgrid.accuracy.points import other_paths, unseen_in_volume, unseen_on_level_sets
 from illumgrid.accuracy.probe import Measured, Probe
-from illumgrid.accuracy.reference import Reference, begin, converge, errors, look_up
+from illumgrid.accuracy.reference import Parts, Reference, begin, converge, errors, look_up, parts_of
 from illumgrid.backends.numba_ import Numba
 from illumgrid.bake.accumulator import Bake
 from illumgrid.chain import rounds
@@ -57,7 +56,7 @@ FIELDS = {
 
 
 def off(light, truth):
-    return errors(look_up(light.grids, truth.queries), truth).rmse
+    return errors(look_up(light.grids, truth.queries)[0], truth).rmse
 
 
 def reference_of(one, other, bounces):
@@ -108,7 +107,7 @@ def test_corners_hold_exactly_what_a_lookup_in_the_built_grid_reads():
         around = corners(scene, specs_over(scene, nodes), asked)
         read, covered = around.read(BACKEND.solve(scene, around.asked, paths=range(8), bounces=2, seed=5))
         assert covered.mean() > 0.5 and around.nodes == light.recipe["queries"]
-        np.testing.assert_allclose(read[covered], look_up(light.grids, asked)[covered], rtol=2e-5)
+        np.testing.assert_allclose(read[covered], look_up(light.grids, asked)[0][covered], rtol=2e-5)
 
 
 def test_the_split_finds_parts_that_were_put_in():
@@ -143,7 +142,7 @@ def test_the_measured_noise_is_that_of_two_built_grids():
     probe = Probe.start(scene, prepare(BACKEND, scene), 1500, 0.05, 0)
     found = probe.measure(specs_over(scene, nodes), probe.fewer(3), 16)
     one, other = (
-        look_up(run(scene, grid=nodes, paths=16, bounces=3, seed=s).grids, probe.reference.queries) for s in (8, 9)
+        look_up(run(scene, grid=nodes, paths=16, bounces=3, seed=s).grids, probe.reference.queries)[0] for s in (8, 9)
     )
     built = ((one - other) ** 2).mean() / 2 / probe.reference.mean**2
     assert found.parts.noise == pytest.approx(built, rel=0.25)
@@ -307,6 +306,6 @@ def test_errors_of_a_known_difference():
     half = Samples(asked, 2 * rgb, 0 * rgb, np.full(n, 9, np.int32))
     truth = reference_of(half, half, 1)
     flat = IlluminationGrid(grid.spec, np.full_like(grid.values, 2.2), grid.error, grid.support)
-    found = errors(look_up([flat], asked), truth)
+    found = errors(look_up([flat], asked)[0], truth)
     for value in (found.rmse, found.median, found.p95, found.bias):
         assert value == pytest.approx(0.1, rel=1e-4)

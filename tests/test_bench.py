@@ -24,7 +24,7 @@ from illumgrid.accuracy.chart.contestants import COUNTS, Method, methods, tracer
 from illumgrid.accuracy.chart.race import Point, Race, Run, front
 from illumgrid.accuracy.cost import Pace
 from illumgrid.accuracy.points import unseen_on_level_sets
-from illumgrid.accuracy.reference import begin, covered, errors, look_up
+from illumgrid.accuracy.reference import begin, errors, look_up
 from illumgrid.backends.numba_ import Numba
 from illumgrid.cli import report
 from illumgrid.cli.report import table
@@ -127,7 +127,7 @@ def test_covered_points_read_only_nodes_with_light(truth):
     cell = np.floor(index).astype(int)
     expected = [all(support[tuple(low + corner)] for corner in np.ndindex(2, 2, 2)) for low in cell]
     assert 0.2 < np.mean(expected) < 0.8 and (index - cell).min() > 1e-4  # no point for which a corner counts nothing
-    np.testing.assert_array_equal(covered([replace(grid, support=support)], asked), expected)
+    np.testing.assert_array_equal(look_up([replace(grid, support=support)], asked)[1], expected)
 
 
 def test_everything_that_is_registered_takes_part_or_is_reported(truth):
@@ -164,9 +164,13 @@ def test_remarks_name_a_blunt_reference_and_missing_seeds(truth):
     one, other = exact.halves
     answer = replace(other.samples, mean=other.samples.mean + 1)
     blunt = replace(exact, halves=(one, replace(other, answers=(answer,))))
-    said = _remarks((point(blunt, 1, 0.01, seeds=1),), {"levelset": blunt})
-    assert "more than a fifth" in said[0] and "fewer than 3 seeds" in said[1]
-    assert not _remarks((point(exact, 1, 0.5),), {"levelset": exact})
+
+    def said(made, reference):
+        return _remarks(Race(SCENE, {"levelset": reference}, [METHOD], [8], 3, 0, [made]), [made])
+
+    blunter, few = said(point(blunt, 1, 0.01, seeds=1), blunt)
+    assert "more than a fifth" in blunter and "fewer than 3 seeds" in few
+    assert not said(point(exact, 1, 0.5), exact)
 
 
 def test_the_chart_can_be_drawn_of_one_point_and_of_many(truth):
@@ -268,11 +272,11 @@ def test_what_is_foreseen_of_a_grid_is_what_the_grid_will_hold(truth):
         run = Run(scene, METHOD, 21, 3, seed)
         run.go_on(8)
         grids = run.fill(Nearest())[0]
-        whole = seen.covered & covered(grids, asked)
+        whole = seen.covered & look_up(grids, asked)[1]
         assert whole.mean() > 0.9
         np.testing.assert_allclose(light[whole], grids[0].lookup(asked.point[whole]), rtol=1e-4, atol=1e-5)
     assert seen.queries == sum(map(len, run.bake.answers)) and not race.missing_seeds()  # it needs no more seeds
-    race.contestants[0].run = Run(scene, METHOD, 21, 3, 5)
+    race.contestants = [Run(scene, METHOD, 21, 3, 5)]
     while contestant := race.next(np.inf):
         race.advance(contestant)
     assert [p.built for p in race.points if p.paths == 8] == [True]  # what is built takes its place
@@ -373,7 +377,7 @@ def test_time_is_kept_for_all_that_another_seed_takes(truth):
     filled.interpolator, beaten.interpolator = Splat(), Rbf()
     plain.filling, filled.filling, beaten.filling = 0.1, 0.6, 8.0
     race.points = [plain, filled, beaten]
-    assert race.missing_seeds() == {plain: pytest.approx(0.9 + 0.1 + 0.6)}
+    assert race.missing_seeds() == [(pytest.approx(0.9 + 0.1 + 0.6), [plain, filled])]
 
 
 @dataclass(frozen=True)

@@ -39,21 +39,16 @@ def measure_pace(
     random = np.random.default_rng((seed, 3))
     per_path, per_node = [], []
     for number, spec in enumerate(specs):
-        nodes = reachable(scene.fields[number], spec)
-        chosen, many = (
-            nodes[np.unique((starts[:, None] + np.arange(64)).clip(0, len(nodes) - 1))]
-            for count in (max(256, about // paths), 1 << 13)
-            for starts in [random.integers(0, max(1, len(nodes) - 63), max(1, min(len(nodes), count) // 64))]
-        )
-        asked = at_nodes(scene, number, spec, chosen)
-        small = GridSpec.over(scene.fields[number].volume, 24)
+        nodes, field = reachable(scene.fields[number], spec), scene.fields[number]
+        many = nodes[(random.integers(0, len(nodes), (128, 1)) + np.arange(64)).ravel() % len(nodes)]
+        asked = at_nodes(scene, number, spec, many[: max(256, about // paths)])
         tracer.solve(asked[:1], paths=range(2), bounces=bounces, seed=seed)  # loads what is compiled
         begun = time.perf_counter()
         answer = tracer.solve(asked, paths=range(paths), bounces=bounces, seed=seed)
-        per_path.append((time.perf_counter() - begun) / (len(chosen) * paths))
+        per_path.append((time.perf_counter() - begun) / (len(asked) * paths))
         # Few nodes would cost as much as many; and the least of three, for in so short a time a stall counts for many.
+        small = GridSpec.over(field.volume, 24)
         asking = timeit.repeat(partial(at_nodes, scene, number, spec, many), number=1, repeat=3)
-        fill = partial(Nearest().fill, answer, Nodes(small, scene.fields[number], number))
-        filling = timeit.repeat(fill, number=1, repeat=3)
+        filling = timeit.repeat(partial(Nearest().fill, answer, Nodes(small, field, number)), number=1, repeat=3)
         per_node.append(min(asking) / len(many) + min(filling) / int(np.prod(small.shape)))
     return Pace(float(np.mean(per_node)), float(np.mean(per_path)))

@@ -2,13 +2,13 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 
 from illumgrid.accuracy.points import unseen_in_volume, unseen_on_walls
 from illumgrid.accuracy.probe import Probe
-from illumgrid.accuracy.reference import Errors, Reference, begin, enough, errors, look_up
+from illumgrid.accuracy.reference import Errors, Reference, begin, errors, look_up
+from illumgrid.bake.bounces import enough_bounces
 from illumgrid.bake.walls import look_up_walls
 from illumgrid.errors import BadInput
 from illumgrid.field.lattice import specs_over
@@ -27,9 +27,8 @@ def judge(
     scene: Scene, tracer: Tracer, grids: Sequence[IlluminationGrid], seed: int, queries: int, paths: int, bounces: int
 ) -> Errors | None:
     """Error of grids at points that no run asks for; None where there is no light or no surface."""
-    unseen = partial(unseen_in_volume, scene)
-    reference = _reference(scene, tracer, unseen, shifted_seed(seed, 2), queries * paths, paths, bounces)
-    return errors(look_up(grids, reference.queries), reference) if reference.mean > 0 else None
+    truth = _reference(scene, tracer, unseen_in_volume, shifted_seed(seed, 2), queries * paths, paths, bounces)
+    return errors(look_up(grids, truth.queries)[0], truth) if truth.mean > 0 else None
 
 
 def judge_walls(
@@ -39,25 +38,25 @@ def judge_walls(
 
     Walls behind nothing are smooth and many, so that an error at shadows alone counts little: see `Errors.p95`.
     """
-    unseen = partial(unseen_on_walls, scene)
-    reference = _reference(scene, tracer, unseen, shifted_seed(seed, 3), texels * paths, paths, bounces)
-    return errors(look_up_walls(scene, walls, reference.queries), reference) if reference.mean > 0 else None
+    truth = _reference(scene, tracer, unseen_on_walls, shifted_seed(seed, 3), texels * paths, paths, bounces)
+    return errors(look_up_walls(scene, walls, truth.queries), truth) if truth.mean > 0 else None
 
 
 def _reference(
-    scene: Scene, tracer: Tracer, unseen: Callable[[int, int], Queries], seed: int, work: int, paths: int, bounces: int
-) -> Reference:
+    scene: Scene, tracer: Tracer, unseen: Callable[[Scene, int, int], Queries],
+    seed: int, work: int, paths: int, bounces: int,
+) -> Reference:  # fmt: skip
     """Light at unseen points.
 
     For a twentieth of the run's work, or what 1024 points take: as many paths as the grids had, which makes the
     reference as sharp as they are, and the more points, for where the light is rough a few of them carry the error.
     The path count is fixed in advance; stopping once the reference looks sharp enough would bias the estimate.
     """
-    followed = enough(scene, tracer, 1e-3, seed)
+    followed, _ = enough_bounces(scene, tracer, seed, 1e-3)
     share = work * (bounces + 1) / (20 * (followed + 1))
     points = int(np.clip(share / max(paths, 1), 1024, 4096))
     many = 2 ** round(np.log2(np.clip(share / points, 32, max(32, paths))))
-    return begin(tracer, unseen(points, seed), followed, seed, many)
+    return begin(tracer, unseen(scene, points, seed), followed, seed, many)
 
 
 def remedies(scene: Scene, backend: Backend, specs: Sequence[GridSpec], bounces: int, seed: int) -> dict[str, float]:

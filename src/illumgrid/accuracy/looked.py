@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from illumgrid.accuracy.reference import covered, look_up
+from illumgrid.accuracy.reference import look_up
 from illumgrid.bake.ahead import Ahead, light_ahead
 from illumgrid.bake.bounces import enough_bounces
 from illumgrid.bake.refined import Chosen
@@ -71,5 +71,4 @@ class Around:
 
     def read(self, samples: Samples) -> tuple[Floats, NDArray[np.bool_]]:
         """Light (n, 3) at the points, and whether (n,) all of their nodes have light of their own."""
-        grids = filled(self.scene, self.ahead, [samples])
-        return look_up(grids, self.points), covered(grids, self.points)
+        return look_up(filled(self.scene, self.ahead, [samples]), self.points)

@@ -13,11 +13,11 @@ import numpy as np
 
 from illumgrid.accuracy.cost import Pace
 from illumgrid.accuracy.looked import Around
-from illumgrid.accuracy.parts import Parts, missing, parts_of
 from illumgrid.accuracy.points import unseen_in_volume
-from illumgrid.accuracy.reference import Reference, begin, converge, enough
+from illumgrid.accuracy.reference import Parts, Reference, begin, converge, missing, parts_of
 from illumgrid.bake.accumulator import Bake
 from illumgrid.bake.ahead import Ahead
+from illumgrid.bake.bounces import enough_bounces
 from illumgrid.errors import BadInput
 from illumgrid.field.scene import Scene
 from illumgrid.grid import GridSpec
@@ -76,7 +76,8 @@ class Probe:
         The reference's own variance is subtracted wherever it is used, so it may be as large as the error judged; it
         has at most `most` paths.
         """
-        first = begin(tracer, unseen_in_volume(scene, points, seed), enough(scene, tracer, 0.1 * error, seed), seed)
+        followed, _ = enough_bounces(scene, tracer, seed, 0.1 * error)
+        first = begin(tracer, unseen_in_volume(scene, points, seed), followed, seed)
         if not first.mean > 0:
             raise BadInput("no light reaches the surfaces of this scene; expected a background or a lamp that does")
         few = first[:: max(1, len(first) // 512)]

@@ -1,4 +1,4 @@
-"""Converged light at points that nobody asked for, and how far a grid is from it."""
+"""Converged light at points that nobody asked for, and how far a grid is from it: noise, nodes, holes, bounces."""
 
 import time
 from collections.abc import Sequence
@@ -10,15 +10,11 @@ from numpy.typing import NDArray
 
 from illumgrid.accuracy.points import other_paths
 from illumgrid.bake.accumulator import Bake
-from illumgrid.bake.bounces import light_left_out
-from illumgrid.field.scene import Scene
 from illumgrid.field.volume import Floats
 from illumgrid.grid import IlluminationGrid
 from illumgrid.rng import shifted_seed
 from illumgrid.transport.samples import Queries
 from illumgrid.transport.tracer import Tracer
-
-MOST_BOUNCES = 128
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,8 +56,7 @@ class Reference:
     @property
     def light(self) -> Floats:
         """Irradiance (n, 3)."""
-        one, other = (half.samples.mean for half in self.halves)
-        return (one.astype(float) + other) / 2
+        return np.asarray(np.mean([half.samples.mean for half in self.halves], axis=0, dtype=float))
 
     @property
     def off(self) -> Floats:
@@ -89,14 +84,6 @@ class Reference:
         """The same paths, ended after fewer bounces."""
         one, other = (Bake.of(h.targets, min(bounces, self.bounces), h.seed) for h in self.halves)
         return replace(self, halves=(one, other)).walk(self.paths)
-
-
-def enough(scene: Scene, tracer: Tracer, tolerance: float, seed: int) -> int:
-    """Reflections beyond which less than `tolerance` of all light is left out."""
-    bounces = 8
-    while bounces < MOST_BOUNCES and light_left_out(scene, tracer, bounces, seed) > tolerance:
-        bounces *= 2
-    return bounces
 
 
 def begin(tracer: Tracer, asked: Queries, bounces: int, seed: int, paths: int = 64) -> Reference:
@@ -132,22 +119,13 @@ class Errors:
     bias: float  # mean difference; below 0 the grid is too dark
 
 
-def look_up(grids: Sequence[IlluminationGrid], asked: Queries) -> Floats:
-    """Light (n, 3) that the grids hold at the points of queries, each in the grid of its field."""
-    light = np.zeros((len(asked), 3))
+def look_up(grids: Sequence[IlluminationGrid], asked: Queries) -> tuple[Floats, NDArray[np.bool_]]:
+    """Light (n, 3) that grids hold at the points of queries, each in the grid of its field; and as `Corners.read`."""
+    light, covered = np.zeros((len(asked), 3)), np.zeros(len(asked), bool)
     for number, grid in enumerate(grids):
         own = asked.target == number
-        light[own] = grid.lookup(asked.point[own])
-    return light
-
-
-def covered(grids: Sequence[IlluminationGrid], asked: Queries) -> NDArray[np.bool_]:
-    """Points that read only nodes with light of their own."""
-    result = np.zeros(len(asked), bool)
-    for number, grid in enumerate(grids):
-        own = asked.target == number
-        result[own] = grid.covered(asked.point[own])
-    return result
+        light[own], covered[own] = grid.lookup(asked.point[own]), grid.covered(asked.point[own])
+    return light, covered
 
 
 def errors(light: Floats, reference: Reference) -> Errors:
@@ -159,3 +137,49 @@ def errors(light: Floats, reference: Reference) -> Errors:
     spread = float(square.std() / np.sqrt(len(square)))
     median, p95 = np.quantile(each, (0.5, 0.95)).tolist()
     return Errors(rmse, spread / (2 * rmse) if rmse > 0 else 0.0, median, p95, float(off.mean()))
+
+
+@dataclass(frozen=True)
+class Parts:
+    """The mean squared error of a grid in parts, each measured; all as squares relative to the mean irradiance."""
+
+    noise: float  # half the mean squared difference of two grids from independent seeds
+    # What interpolation between nodes does, at points whose nodes all have light of their own: the mean product of the
+    # two grids' errors, in which noise cancels. An estimate of 0 may come out slightly negative.
+    grid: float
+    uncovered: float  # the same at points that read a node without support
+    bounces: float  # mean square of the light that more bounces add at the points themselves
+    cross: float  # what the sum of the four lacks of the total: the grid's error and missing bounces are correlated
+    uncertain: float  # standard error of `grid`, from the spread over the points
+
+    @property
+    def total(self) -> float:
+        """Mean squared error."""
+        return max(0.0, self.noise + self.grid + self.uncovered + self.bounces + self.cross)
+
+
+def missing(fewer: Reference, reference: Reference) -> Floats:
+    """Light (n, 3), relative, that the bounces beyond those of `fewer` add to the same paths."""
+    return (reference.light - fewer.light) / reference.mean
+
+
+def parts_of(one: Floats, other: Floats, covered: NDArray[np.bool_], fewer: Reference, reference: Reference) -> Parts:
+    """Split the error of a grid, from what two that differ in their seeds hold, (n, 3), at the points of a reference.
+
+    `covered` (n,) marks points whose nodes all have light of their own; `fewer` is the light at the points by the same
+    paths, cut off after as many bounces as the grids had.
+    """
+    light, mean = fewer.light, reference.mean
+    first, second = (one - light) / mean, (other - light) / mean
+    more = missing(fewer, reference)
+    # The paths that stand for the exact light are in both errors: their own variance is subtracted.
+    both = (first * second).mean(axis=1) - (fewer.off**2).mean(axis=1) / mean**2
+    inside = np.where(covered, both, 0.0)
+    return Parts(
+        noise=float(((first - second) ** 2).mean()) / 2,
+        grid=float(inside.mean()),
+        uncovered=float(np.where(covered, 0.0, both).mean()),
+        bounces=float((more**2).mean()),
+        cross=-float(((first + second) * more).mean()),
+        uncertain=float(inside.std() / np.sqrt(len(both))),
+    )

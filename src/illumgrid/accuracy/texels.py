@@ -9,9 +9,8 @@ from functools import partial
 
 import numpy as np
 
-from illumgrid.accuracy.parts import parts_of
 from illumgrid.accuracy.points import unseen_on_walls
-from illumgrid.accuracy.reference import begin
+from illumgrid.accuracy.reference import begin, parts_of
 from illumgrid.bake.accumulator import Bake
 from illumgrid.bake.walls import at_texels, place_on_walls
 from illumgrid.field.scene import Levels, Scene, finer_texels
@@ -57,17 +56,15 @@ def walls_for(scene: Scene, tracer: Tracer, levels: Levels, bounces: int, error:
     truth = begin(tracer, unseen_on_walls(scene, POINTS, seed), bounces, seed, REFERENCE_PATHS)
     if not truth.mean > 0:
         return None
-    seeds, tried = (seed, shifted_seed(seed, 2**62)), list[Walls]()
+    seeds, best = (seed, shifted_seed(seed, 2**62)), Walls(0.0, np.inf, False)
     for finer in FINER:
         around = texels_around(finer_texels(scene, finer), levels, truth.queries)
         bakes = (Bake.of([around.asked], bounces, s).walk(tracer, range(PATHS)) for s in seeds)
         (one, covered), (other, _) = (around.read(bake.samples) for bake in bakes)
         parts = parts_of(one, other, covered, truth, truth)
         off = float(np.sqrt(max(parts.grid + parts.uncovered, 0.0)))
-        tried.append(Walls(finer, off, off <= SHARE * error))
-        if tried[-1].met:
-            return tried[-1]
-    best = tried[0]
-    for walls in tried[1:]:
-        best = walls if walls.off < GAIN * best.off else best
+        walls = Walls(finer, off, off <= SHARE * error)
+        if walls.met:
+            return walls
+        best = walls if off < GAIN * best.off else best
     return best

@@ -1,6 +1,6 @@
 """Closed forms against backends: a table of z-scores."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 from illumgrid import registry
 from illumgrid.errors import BadInput
@@ -12,44 +12,33 @@ _FALSE_ALARM = 1e-3  # probability that a table of right answers has a row that 
 _SLOWER = {"reference": 128, "embree": 8}  # times fewer paths
 
 
-def contenders() -> dict[str, Backend]:
-    """The backends of light that work on this machine, by the names of the table; numba with both of its surfaces."""
-    return {title: stage for title, stage, can in registry.backends() if can.transport}
-
-
-def _named(names: Iterable[str | Backend]) -> dict[str, Backend]:
-    """Stages by the names of the table; "numba" alone is both of its surfaces."""
+def contenders(names: Iterable[str] = ()) -> dict[str, Backend]:
+    """Backends of light by the names of the table: those named, or all that work here; "numba" is both surfaces."""
+    able = {title: stage for title, stage, can in registry.backends() if can.transport}
     found: dict[str, Backend] = {}
-    everyone = contenders()
     for name in names:
-        if not isinstance(name, str):
-            found[name.name] = name
-        elif matching := {title: stage for title, stage in everyone.items() if name in (title, title.split(":")[0])}:
-            found |= matching
-        else:
-            found[name] = registry.backend(name)
-    return found
+        matching = {title: stage for title, stage in able.items() if name in (title, title.split(":")[0])}
+        found |= matching or {name: registry.backend(name)}
+    return found or able
 
 
 def check(
-    backends: Iterable[str | Backend] | None = None,
-    paths: int = 1 << 18,
-    seed: int = 0,
-    cases: Sequence[Case] | None = None,
+    backends: Mapping[str, Backend], paths: int = 1 << 18, seed: int = 0, cases: Sequence[Case] | None = None
 ) -> Iterator[Row]:
     """Judge every case with every backend; yield each row as soon as it is judged.
 
-    Backends are stages or names such as "numba:mesh" or "embree". The queries of a case share its `paths`, of which
-    slow backends trace fewer. Right answers get a row that disagrees once in a thousand tables.
+    The queries of a case share its `paths`, of which slow backends trace fewer. Right answers get a row that disagrees
+    once in a thousand tables.
     """
     if not 1 <= paths < 2**31:
         raise BadInput(f"{paths} paths were asked for; expected at least 1 and fewer than 2**31")
-    stages = contenders() if backends is None else _named(backends)
     cases = [make() for make in CASES] if cases is None else cases
     level = _FALSE_ALARM / 2  # one half for the means, one for the single queries
-    limit = sidak(max(1, 3 * len(cases) * len(stages)), level)
-    limit_each = sidak(max(1, 3 * sum(len(case.expected) for case in cases) * len(stages)), level)
-    for title, backend in stages.items():
-        for case in cases:
-            if applies(case, backend):
-                yield judge(case, backend, paths // _SLOWER.get(title, 1), seed, limit, limit_each, title)
+    limit = sidak(max(1, 3 * len(cases) * len(backends)), level)
+    limit_each = sidak(max(1, 3 * sum(len(case.expected) for case in cases) * len(backends)), level)
+    return (
+        judge(case, backend, paths // _SLOWER.get(title, 1), seed, limit, limit_each, title)
+        for title, backend in backends.items()
+        for case in cases
+        if applies(case, backend)
+    )

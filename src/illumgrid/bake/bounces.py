@@ -55,10 +55,10 @@ def light_left_out(scene: Scene, tracer: Tracer, bounces: int, seed: int = 0) ->
     return 1.0 - mean[0] / mean[1] if mean[1] > 0 else 0.0
 
 
-def enough_bounces(scene: Scene, tracer: Tracer, seed: int = 0) -> tuple[int, float]:
-    """Reflections to follow, and the share of light left out: below 1 %, and at least `LEAST` reflections."""
+def enough_bounces(scene: Scene, tracer: Tracer, seed: int = 0, limit: float = LEFT_OUT) -> tuple[int, float]:
+    """Reflections to follow, and the share of light left out: below the limit, and at least `LEAST` reflections."""
     bounces, left_out = LEAST, light_left_out(scene, tracer, LEAST, seed)
-    while bounces < 128 and left_out >= LEFT_OUT:
+    while bounces < 128 and left_out >= limit:
         bounces += max(1, bounces // 4)
         left_out = light_left_out(scene, tracer, bounces, seed)
     return bounces, left_out

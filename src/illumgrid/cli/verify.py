@@ -26,12 +26,12 @@ def verify(
     z is the mean difference over the queries, divided by its standard error and a derived bound on the error of the
     discretised surface; max |z| is the largest of a single query.
     """
-    from illumgrid.accuracy.verify import check
+    from illumgrid.accuracy.verify import check, contenders
     from illumgrid.transport.agreement import HEADER, line
 
+    rows, found = [], check(contenders(backends or ()), paths, seed)  # refuses before anything is printed
     typer.echo(HEADER)
-    rows = []
-    for row in check(backends or None, paths, seed):
+    for row in found:
         typer.echo(line(row))
         rows.append(row)
     wrong = sum(not row.agrees for row in rows)

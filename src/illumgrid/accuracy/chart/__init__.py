@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 
@@ -12,10 +13,10 @@ from illumgrid.accuracy.chart.race import SEEDS, Flip, Point, Race, front
 from illumgrid.accuracy.cost import measure_pace
 from illumgrid.accuracy.points import unseen_on_level_sets
 from illumgrid.accuracy.probe import Measured, Probe
-from illumgrid.accuracy.reference import Reference, begin, converge, enough
+from illumgrid.accuracy.reference import Reference, begin, converge
 from illumgrid.bake.accumulator import Progress
 from illumgrid.bake.ahead import refinable_by
-from illumgrid.bake.bounces import light_left_out
+from illumgrid.bake.bounces import enough_bounces, light_left_out
 from illumgrid.bake.refined import LOOKED
 from illumgrid.constants import BASE, PATHS
 from illumgrid.errors import BadInput
@@ -103,14 +104,11 @@ def bench(
     if not race.points:
         raise BadInput("no contestant could finish; " + "; ".join(notes + race.notes))
     race.repeat(begun + racing, report, flip)
-    best = {
-        s: min((p.rmse(r) for p in race.points if p.method.surface == s), default=1.0) for s, r in references.items()
-    }
-    _sharpen(references, {surface: error / 5 for surface, error in best.items()}, before_parts - report())
+    _sharpen(references, {surface: race.least(surface) / 5 for surface in references}, before_parts - report())
     race.repeat(begun + before_parts, report, flip)  # what the references did not need goes into missing seeds
     parts = measure_parts(scene, auto, sizes(scene), bounces, seed, budget - report(), pace)
     shown = tuple(front(race.points, references))
-    notes += [*race.notes, *_remarks(shown, references)]
+    notes += [*race.notes, *_remarks(race, shown)]
     return Report(tuple(race.points), shown, references, tuple(parts), bounces, tuple(notes), report())
 
 
@@ -129,7 +127,8 @@ def _unseen(scene: Scene, budget: float, seed: int) -> Queries:
 
 def _tracer_of(entrants: Sequence[Method], surface: str) -> Tracer:
     """The fastest tracer of a surface that computes its reference: a plugin's only where the package has none."""
-    return min((m for m in entrants if m.surface == surface), key=lambda m: (not m.own, m.slow)).tracer
+    own = {m: registry.entry("backend", m.backend.name).package == "illumgrid" for m in entrants}
+    return min((m for m in entrants if m.surface == surface), key=lambda m: (not own[m], m.slow)).tracer
 
 
 def _references(
@@ -139,7 +138,7 @@ def _references(
     found: dict[str, Reference] = {}
     pace = 0.0
     surfaces = sorted({method.surface for method in entrants})
-    most = enough(scene, _tracer_of(entrants, surfaces[0]), 2e-4, seed)
+    most, _ = enough_bounces(scene, _tracer_of(entrants, surfaces[0]), seed, 2e-4)
     for surface in surfaces:
         tracer, begun = _tracer_of(entrants, surface), time.perf_counter()
         if found:  # meshes may take longer to build than rays to cast: try one level set
@@ -177,7 +176,7 @@ def _sharpen(references: dict[str, Reference], error: dict[str, float], left: fl
 def _show_default(race: Race, grid: int | None, paths: int | None, budget: float) -> list[str]:
     """Chart `run`'s default; if it would take too much of the budget, predict it."""
     own = registry.auto_backend()
-    entrants = [c.run.method for c in race.contestants if c.run.method.surface == "levelset"]
+    entrants = [c.method for c in race.contestants if c.method.surface == "levelset"]
     method = next((m for m in entrants if m.sampler == Direct() and m.backend.name == own), None)
     nearest = next((i for i in method.interpolators if i.name == "nearest"), None) if method else None
     if method is None or nearest is None:
@@ -235,26 +234,22 @@ def measure_parts(
     points = int(np.clip(seconds / 2 / each, *PARTS_POINTS))
     probe = Probe.start(scene, tracer, points, 0.004, shifted_seed(seed, 1), PARTS_REFERENCE)
     fewer, found = probe.fewer(bounces), list[Measured]()
-    for paths in PARTS_PATHS:
-        for size in sizes:
-            now = time.perf_counter()
-            if now - begun + last > seconds and found:
-                break
+    for paths, size in product(PARTS_PATHS, sizes):
+        now = time.perf_counter()
+        if now - begun + last <= seconds or not found:
             found.append(probe.measure(specs_over(scene, size), fewer, paths))
             last = (time.perf_counter() - now) * (4 if size == sizes[-1] else 1.5)
     return sorted(found, key=lambda m: (m.grid, m.paths))
 
 
-def _remarks(best: Sequence[Point], references: dict[str, Reference]) -> list[str]:
+def _remarks(race: Race, best: Sequence[Point]) -> list[str]:
     """What a reader of the chart must know about how certain it is."""
-    found = []
-    for surface, reference in references.items():
-        own = [p.rmse(reference) for p in best if p.method.surface == surface]
-        if own and reference.error > min(own) / 5:
-            found.append(
-                f"the reference of the {surface} has an error of {reference.error:.2%}, more than a fifth of the "
-                f"smallest that it judges, {min(own):.2%}; its variance is subtracted, and a larger budget sharpens it"
-            )
+    found = [
+        f"the reference of the {surface} has an error of {reference.error:.2%}, more than a fifth of the smallest that "
+        f"it judges, {least:.2%}; its variance is subtracted, and a larger budget sharpens it"
+        for surface, reference in race.references.items()
+        if reference.error > (least := race.least(surface)) / 5
+    ]
     if few := sum(len(p.seconds) < SEEDS for p in best):
         found.append(f"{few} points of the front were run with fewer than {SEEDS} seeds: the budget was over")
     return found

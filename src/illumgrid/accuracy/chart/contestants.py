@@ -28,7 +28,6 @@ class Method:
     interpolators: tuple[Interpolator, ...]
     denser: "Method | None" = None  # the same with more level sets, tried after this one
     slow: float = 1.0  # what the backend takes, over what the fastest one takes
-    own: bool = True  # whether the backend is of this package and not a plugin's
     looked: bool = False  # whether a first look chooses the nodes, as `run` does under a sky
 
     def label(self, interpolator: Interpolator) -> str:
@@ -58,8 +57,7 @@ def tracers(scene: Scene, asked: Queries, budget: float) -> tuple[list[Method], 
             notes.append(f"{backend.name} does not compete: {reason or type(reason).__name__}")
             continue
         spent = (time.perf_counter() - begun) * 64 / len(few)
-        own = registry.entry("backend", backend.name).package == "illumgrid"
-        found.append(Method(None, backend, tracer, can.surface, (), slow=spent, own=own))
+        found.append(Method(None, backend, tracer, can.surface, (), slow=spent))
     fastest = min((method.slow for method in found), default=1.0)
     late = [method for method in found if method.slow > max(SLOWEST * budget, fastest)]
     notes += [f"{m.backend.name} does not compete: 64 queries with 4 paths took {m.slow:.2f} s" for m in late]

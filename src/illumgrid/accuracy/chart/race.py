@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from illumgrid.accuracy.chart.contestants import COUNTS, Method
 from illumgrid.accuracy.looked import Around, looked
-from illumgrid.accuracy.reference import Reference, covered, errors, look_up
+from illumgrid.accuracy.reference import Reference, errors, look_up
 from illumgrid.bake.accumulator import Bake
 from illumgrid.bake.ahead import Ahead
 from illumgrid.bake.targets import of_field
@@ -61,7 +61,10 @@ class Point:
 
 
 class Run:
-    """A method on one size of grid with one seed, which goes on with more paths: earlier ones are kept."""
+    """A method on one size of grid with one seed, which goes on with more paths: earlier ones are kept.
+
+    In a race it is a contestant, which says what its next step costs and how promising it is.
+    """
 
     def __init__(self, scene: Scene, method: Method, grid: int | None, bounces: int, seed: int) -> None:
         self.scene, self.method, self.grid, self.seed = scene, method, grid, seed
@@ -70,6 +73,12 @@ class Run:
         self.bake = Bake.of([], bounces, seed)
         self.ahead: Ahead | None = None
         self.asking = self.tracing = 0.0
+        self.interpolators = method.interpolators
+        self.step = 0  # of STEPS, the next one; beyond them, or none, where it has come to its end
+        self.cost = 0.0  # of that step, predicted
+        # Until it has run, a slow backend counts as off the front by its slowness.
+        self.factor = method.slow  # what the slowdown of `ranked_by` is multiplied by
+        self.ranked_by: Sequence[Point] = ()  # its own last points, or at first those of the one that it came from
 
     def go_on(self, paths: int | None) -> None:
         """Trace until each query has so many paths, by default as many as `run` takes after a first look."""
@@ -90,13 +99,13 @@ class Run:
             self.tracing += time.perf_counter() - begun
 
     def fill(self, interpolator: Interpolator) -> tuple[list[IlluminationGrid], float]:
-        """Grids from the samples so far, and the seconds that this took, all in all."""
+        """Grids from the samples so far, and the seconds that the interpolator took."""
         begun = time.perf_counter()
         grids, interpolator = [], self.ahead.interpolator if self.ahead else interpolator
         for number, spec in enumerate(self.specs):
             own = of_field(self.scene, self.bake.answers, number)
             grids.append(fill_nodes(interpolator, own, Nodes(spec, self.scene.fields[number], number)))
-        return grids, self.asking + self.tracing + time.perf_counter() - begun
+        return grids, time.perf_counter() - begun
 
 
 def front(points: Iterable[Point], references: dict[str, Reference]) -> list[Point]:
@@ -118,20 +127,6 @@ def slowdown(point: Point, error: dict[Point, float]) -> float:
 
 
 @dataclass(eq=False)
-class Contestant:
-    """A method on one size of grid."""
-
-    run: Run
-    interpolators: tuple[Interpolator, ...]
-    step: int = 0
-    cost: float = 0.0  # of the next step, predicted
-    ranked_by: tuple[Point, ...] = ()  # its own last points, or at first those of the contestant that it came from,
-    factor: float = 1.0  # ... and what their slowdown is multiplied by
-    converged: bool = False
-    first: bool = True
-
-
-@dataclass(eq=False)
 class Race:
     """Methods on grids of `sizes`, coarse to fine, advanced one step at a time; references by surface judge them."""
 
@@ -145,28 +140,23 @@ class Race:
     notes: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        # Until it has run, a slow backend counts as off the front by its slowness. The first contestant shows what the
-        # others will cost: one that builds no meshes.
-        self.contestants = [
-            Contestant(self._run(method, self.sizes[0]), method.interpolators, factor=method.slow)
-            for method in sorted(self.methods, key=lambda m: (m.surface != "levelset", m.slow))
-        ]
+        # The first shows what the others will cost: one that builds no meshes.
+        ordered = sorted(self.methods, key=lambda m: (m.surface != "levelset", m.slow))
+        self.contestants = [self._run(method, self.sizes[0]) for method in ordered]
 
     def _run(self, method: Method, grid: int | None, again: int = 0) -> Run:
         return Run(self.scene, method, grid, self.bounces, shifted_seed(self.seed, again))
 
     def show_default(self, method: Method, nearest: Interpolator, grid: int | None, paths: int | None) -> None:
-        """Chart what `run` does when nothing is asked for, before all others; its contestant goes on from there."""
+        """Chart what `run` does when nothing is asked for, before all others; it goes on from there."""
         run = self._run(method, grid)
         run.go_on(paths)
         point, _ = self._point(run, nearest)
         point.default = True
         self.points.append(point)
-        step = sum(fewer < point.paths for fewer in STEPS)
-        if step < len(STEPS):
-            cost = point.time - run.tracing + run.tracing * (STEPS[step] / point.paths - 1)
-            first = grid in self.sizes
-            self.contestants.append(Contestant(run, method.interpolators, step, cost, (point,), first=first))
+        run.step, run.factor, run.ranked_by = sum(fewer < point.paths for fewer in STEPS), 1.0, [point]
+        self._foresee(run, point.time - run.tracing)
+        self.contestants.append(run)
 
     def predict(
         self, method: Method, nearest: Interpolator, grid: int | None, paths: int, takes: float, default: bool = False
@@ -197,123 +187,116 @@ class Race:
         point.seconds, point.light = [takes], [light]
         self.points.append(point)
 
-    def advance(self, contestant: Contestant) -> None:
+    def advance(self, run: Run) -> None:
         """Take the next step of a contestant, and fill the grid by every interpolator."""
-        run, paths = contestant.run, STEPS[contestant.step]
-        begun = time.perf_counter()
-        own = [p for p in self.points if p.method is run.method and p.grid == run.grid]
-        same = [p for p in own if p.paths == paths]
+        paths, begun = STEPS[run.step], time.perf_counter()
+        same = [p for p in self.points if (p.method, p.grid, p.paths) == (run.method, run.grid, paths)]
         known = {p.interpolator: p for p in same if p.built}
         try:
             run.go_on(paths)
-            new = [known.get(filler) or self._point(run, filler)[0] for filler in contestant.interpolators]
+            new = [known.get(filler) or self._point(run, filler)[0] for filler in run.interpolators]
         except BadInput as reason:
             self.notes.append(f"{run.method.label(run.method.interpolators[0])}, {run.longest} nodes: {reason}")
-            self.contestants.remove(contestant)
+            run.step = len(STEPS)
             return
         spent = time.perf_counter() - begun
         for other in self.contestants:
             if other.cost == 0.0:  # nobody has run before this one
-                other.cost = spent * other.run.method.slow / run.method.slow
+                other.cost = spent * other.method.slow / run.method.slow
         self.points = [p for p in self.points if p.built or p not in same]  # built is better than predicted
         self.points += [p for p in new if p.interpolator not in known]
-        self._rank(contestant, new, [p for p in own if p.paths == STEPS[contestant.step - 1]])
-        contestant.step += 1
-        if contestant.step < len(STEPS):
-            filling = sum(p.filling for p in new if p.interpolator in contestant.interpolators)
-            contestant.cost = run.tracing * (STEPS[contestant.step] / paths - 1) + filling
-        if contestant.first:
-            contestant.first = False
-            self._unlock(contestant, spent)
+        self._rank(run, new)
+        self._foresee(run, sum(p.filling for p in new if p.interpolator in run.interpolators))
+        self._unlock(run, spent)
 
-    def _rank(self, contestant: Contestant, new: list[Point], before: list[Point]) -> None:
-        """Compare new points with the front: drop interpolators that hold the others up, and see what has converged."""
-        standing, run = self._standing(), contestant.run
-        contestant.ranked_by, contestant.factor = tuple(new), 1.0
-        least, light = self._slowdown(contestant, standing), run.asking + run.tracing
-        contestant.interpolators = tuple(
+    def _rank(self, run: Run, new: list[Point]) -> None:
+        """Compare new points with the front: drop interpolators that hold the others up, and end what has converged."""
+        reference, paths = self.references[run.method.surface], STEPS[run.step]
+        before = [p for p in run.ranked_by if p.grid == run.grid and p.paths < paths]
+        now, then = (min((p.rmse(reference) for p in points), default=np.inf) for points in (new, before))
+        run.step = run.step + 1 if now <= 0.9 * then else len(STEPS)
+        standing, run.ranked_by, run.factor = self._standing(), new, 1.0
+        least, light = self._slowdown(run, standing), run.asking + run.tracing
+        run.interpolators = tuple(
             p.interpolator for p in new if p.filling <= 0.5 * light or slowdown(p, standing) <= max(4.0, 2.0 * least)
         )
-        reference = self.references[run.method.surface]
-        now, then = (min((p.rmse(reference) for p in points), default=np.inf) for points in (new, before))
-        contestant.converged = now > 0.9 * then
 
-    def _unlock(self, contestant: Contestant, spent: float) -> None:
-        """What comes after a first step: the next finer grid, and on the coarsest more level sets."""
-        run = contestant.run
+    def _foresee(self, run: Run, filling: float) -> None:
+        """Predict the cost of a next step, whose paths beyond those so far take as long as these, each."""
+        if run.step < len(STEPS):
+            run.cost = run.tracing * (STEPS[run.step] / run.bake.paths - 1) + filling
 
-        def add(method: Method, grid: int, cost: float, factor: float) -> None:
-            ahead, ranked_by = self._run(method, grid), contestant.ranked_by
-            self.contestants.append(Contestant(ahead, contestant.interpolators, 0, cost, ranked_by, factor))
+    def _unlock(self, run: Run, spent: float) -> None:
+        """After a first step, enter the next finer grid, and on the coarsest more level sets."""
 
-        finer = [size for size in self.sizes if size > run.longest]
-        if finer and not any(c.run.method is run.method and c.run.grid == finer[0] for c in self.contestants):
+        def enter(method: Method, grid: int, cost: float, factor: float) -> None:
+            if not any((c.method, c.grid) == (method, grid) for c in self.contestants):
+                new = self._run(method, grid)
+                new.interpolators, new.cost, new.factor, new.ranked_by = run.interpolators, cost, factor, run.ranked_by
+                self.contestants.append(new)
+
+        if finer := [size for size in self.sizes if size > run.longest]:
             # Twice the nodes may halve the error, for which noise would need four times the paths: so much sooner.
             more = finer[0] / run.longest
-            add(run.method, finer[0], spent * more**3, 1 / more**2)
+            enter(run.method, finer[0], spent * more**3, 1 / more**2)
         if run.method.denser and run.grid == self.sizes[0]:
-            add(run.method.denser, self.sizes[0], spent * COUNTS[1] / COUNTS[0], 1.0)
+            enter(run.method.denser, self.sizes[0], spent * COUNTS[1] / COUNTS[0], 1.0)
 
     def _point(self, run: Run, interpolator: Interpolator) -> tuple[Point, list[IlluminationGrid]]:
-        grids, seconds = run.fill(interpolator)
-        asked, queries = self.references[run.method.surface].queries, sum(map(len, run.bake.answers))
-        read, filling, light = covered(grids, asked), seconds - run.asking - run.tracing, [look_up(grids, asked)]
-        point = Point(run.method, interpolator, run.grid, run.bake.paths, queries, read, run.longest)
-        return replace(point, seconds=[seconds], filling=filling, light=light), grids
+        grids, filling = run.fill(interpolator)
+        light, covered = look_up(grids, self.references[run.method.surface].queries)
+        queries, seconds = sum(map(len, run.bake.answers)), run.asking + run.tracing + filling
+        point = Point(run.method, interpolator, run.grid, run.bake.paths, queries, covered, run.longest)
+        return replace(point, seconds=[seconds], filling=filling, light=[light]), grids
 
     def _standing(self) -> dict[Point, float]:
         """Errors of all points."""
         return {p: max(1e-9, p.rmse(self.references[p.method.surface])) for p in self.points}
 
-    def _slowdown(self, contestant: Contestant, standing: dict[Point, float]) -> float:
-        """How far behind the front a contestant is to be expected."""
-        return contestant.factor * min((slowdown(p, standing) for p in contestant.ranked_by), default=1.0)
+    def least(self, surface: str) -> float:
+        """Smallest error that the reference of a surface judges."""
+        own = (p.rmse(self.references[surface]) for p in self.points if p.method.surface == surface)
+        return min(own, default=np.inf)
 
-    def next(self, left: float) -> Contestant | None:
+    def _slowdown(self, run: Run, standing: dict[Point, float]) -> float:
+        """How far behind the front a contestant is to be expected."""
+        return run.factor * min((slowdown(p, standing) for p in run.ranked_by), default=1.0)
+
+    def next(self, left: float) -> Run | None:
         """The contestant to advance: least predicted time, times its slowdown; None if the rest is too costly.
 
         What the seeds will cost that the front still lacks is kept back.
         """
-        kept = 1.1 * (SEEDS - 1) * sum(self.missing_seeds().values())
-        able = [c for c in self.contestants if not c.converged and c.step < len(STEPS)]
+        kept = 1.1 * (SEEDS - 1) * sum(seconds for seconds, _ in self.missing_seeds())
+        able = [c for c in self.contestants if c.step < len(STEPS)]
         able = [c for c in able if kept + SEEDS * c.cost < left or c.cost == 0.0]
         standing = self._standing()
-        return min(able, key=lambda c: (c.cost * self._slowdown(c, standing), c.run.longest), default=None)
+        return min(able, key=lambda c: (c.cost * self._slowdown(c, standing), c.longest), default=None)
 
-    def missing_seeds(self) -> dict[Point, float]:
-        """For each method and grid the front's point of most paths that lacks seeds, and seconds for one seed more."""
-        best = front(self.points, self.references)
-        found: dict[tuple[int, int | None], Point] = {}
-        for point in best:
-            key = id(point.method), point.grid
-            if point.built and len(point.seconds) < SEEDS and (key not in found or found[key].paths < point.paths):
-                found[key] = point
-        return {p: p.time - p.filling + sum(q.filling for q in self._together(best, p)) for p in found.values()}
-
-    def _together(self, best: list[Point], most: Point) -> list[Point]:
-        """What one more seed of a point runs: its paths or fewer, by the interpolators of the front."""
-        fillers = {p.interpolator for p in best}
-        same = [p for p in self.points if p.method is most.method and p.grid == most.grid and p.built]
-        return [p for p in same if p.paths <= most.paths and p.interpolator in fillers]
+    def missing_seeds(self) -> list[tuple[float, list[Point]]]:
+        """Points of the front that lack seeds, by method and grid, and what one seed more of them takes, in seconds."""
+        groups: dict[tuple[Method, int | None], list[Point]] = {}
+        for p in front(self.points, self.references):
+            if p.built and len(p.seconds) < SEEDS:
+                groups.setdefault((p.method, p.grid), []).append(p)
+        return [(max(p.time - p.filling for p in g) + sum(p.filling for p in g), g) for g in groups.values()]
 
     def repeat(self, deadline: float, report: Callable[[], object], flip: Flip | None = None) -> None:
         """Run the front's points with other seeds, until every one of them has enough."""
         while missing := self.missing_seeds():
-            most = min(missing, key=lambda p: missing[p])
-            if time.perf_counter() + missing[most] > deadline:
+            seconds, points = min(missing, key=lambda found: found[0])
+            if time.perf_counter() + seconds > deadline:
                 return
-            same = self._together(front(self.points, self.references), most)
-            again = max(len(p.seconds) for p in same if p.paths == most.paths)
-            run, before = self._run(most.method, most.grid, again), resident(reset=True)
-            for point in sorted(same, key=lambda p: p.paths):
+            again = min(len(p.seconds) for p in points)
+            run, before = self._run(points[0].method, points[0].grid, again), resident(reset=True)
+            for point in sorted((p for p in points if len(p.seconds) == again), key=lambda p: p.paths):
                 run.go_on(point.paths)
-                if len(point.seconds) == again:
-                    new, grids = self._point(run, point.interpolator)
-                    point.seconds += new.seconds
-                    point.light += new.light
-                    point.memory = (resident() or 0.0) - before if before else None
-                    if flip and point.flip is None:
-                        point.flip = flip(grids)
+                new, grids = self._point(run, point.interpolator)
+                point.seconds += new.seconds
+                point.light += new.light
+                point.memory = (resident() or 0.0) - before if before else None
+                if flip and point.flip is None:
+                    point.flip = flip(grids)
             report()
 
 
