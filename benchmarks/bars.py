@@ -12,7 +12,8 @@ import numpy as np
 from stability import IMAGES, hills
 
 import illumgrid as ig
-from illumgrid.field.volume import Volume, smooth
+from illumgrid.field.filters import smooth
+from illumgrid.field.volume import Volume
 from illumgrid.stages import on_level_sets
 from illumgrid.transport.samples import join_queries
 

@@ -40,8 +40,8 @@ from illumgrid.accuracy.points import unseen_in_volume, unseen_on_level_sets
 from illumgrid.accuracy.reference import begin, converge, errors, look_up
 from illumgrid.bake.accumulator import Bake
 from illumgrid.cli.report import files
+from illumgrid.field.filters import smooth
 from illumgrid.field.scene import level_table
-from illumgrid.field.volume import smooth
 from illumgrid.transport.tracer import prepare
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -69,7 +69,7 @@ def reference(file, lit, limits, sigma, keep):
         from illumgrid.accuracy.points import unseen_on_level_sets
         from illumgrid.accuracy.reference import begin, converge
         from illumgrid.bake.bounces import enough_bounces
-        from illumgrid.field.volume import smooth
+        from illumgrid.field.filters import smooth
         from illumgrid.transport.tracer import prepare
 
         volume = read_volume(file)

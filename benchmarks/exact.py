@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 
 import illumgrid as ig
-from illumgrid.field.volume import smooth
+from illumgrid.field.filters import smooth
 from illumgrid.show import fit_camera, render
 from illumgrid.show.engines import software
 from illumgrid.show.exact import Exact, Gathering, looked_up, steps_to, tracer_of

@@ -17,8 +17,9 @@ from scipy.spatial import KDTree
 
 from illumgrid import GridSpec, Scene, interpolator, isosurface, read_volume
 from illumgrid import backend as backend_named
+from illumgrid.field.filters import smooth
 from illumgrid.field.scene import level_table
-from illumgrid.field.volume import index_to_world, interpolate, smooth
+from illumgrid.field.volume import index_to_world, interpolate
 from illumgrid.grid import Nodes
 from illumgrid.samplers.adaptive import adaptive_rows
 from illumgrid.stages import on_level_sets

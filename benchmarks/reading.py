@@ -25,7 +25,7 @@ BOUNCES = 6
 def fields(folder):
     """Scene and nodes along the longest axis of each field by name."""
     from illumgrid import Scene, read_volume
-    from illumgrid.field.volume import smooth
+    from illumgrid.field.filters import smooth
 
     def block(volume, side=40):
         at = [(n - side) // 2 for n in volume.shape]

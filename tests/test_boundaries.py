@@ -9,7 +9,8 @@ from scipy.ndimage import gaussian_filter, label
 from scipy.signal import find_peaks
 
 from illumgrid.field.boundaries import _peaks, boundaries, otsu_threshold, suggest_range
-from illumgrid.field.volume import Volume, smooth
+from illumgrid.field.filters import smooth
+from illumgrid.field.volume import Volume
 
 GRID = np.indices((48, 44, 40)) - np.array([24, 22, 20])[:, None, None, None]
 RADIUS = np.sqrt((GRID**2).sum(axis=0))

@@ -9,7 +9,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 from skimage.measure import marching_cubes
 
-from illumgrid.backends.mesh import bvh
+from illumgrid.backends.mesh import bvh, traversal
 
 RAYS = int(os.environ.get("BVH_RAYS", 400_000))  # into each of ten sealed cavities
 BATCH = 1_000_000
@@ -19,7 +19,7 @@ def cast(tree, origin, direction, limit=np.inf, any_hit=False):
     origin, direction = np.ascontiguousarray(origin, float), np.ascontiguousarray(direction, float)
     n = len(origin)
     t, face, uv = np.zeros(n), np.zeros(n, np.int64), np.zeros((n, 2), np.float32)
-    bvh.cast_rays(tree, bvh.stack_for(tree), origin, direction, limit, any_hit, t, face, uv)
+    traversal.cast_rays(tree, bvh.stack_for(tree), origin, direction, limit, any_hit, t, face, uv)
     return t, face, uv
 
 

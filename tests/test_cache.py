@@ -15,9 +15,10 @@ from illumgrid.bake.bounces import enough_bounces
 from illumgrid.bake.known import MOST_BIAS, light_known_first
 from illumgrid.constants import BASE
 from illumgrid.errors import BadInput
+from illumgrid.field.filters import smooth
 from illumgrid.field.lattice import specs_over
 from illumgrid.field.scene import Scene, level_table
-from illumgrid.field.volume import Volume, smooth
+from illumgrid.field.volume import Volume
 from illumgrid.grid import GridSpec, IlluminationGrid, WallTexture, channels_of
 from illumgrid.grid.cache import NO_CACHE, cache_of
 from illumgrid.interpolators.nearest import Nearest

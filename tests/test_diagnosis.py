@@ -9,9 +9,10 @@ import pytest
 from illumgrid.errors import WARNINGS, tell
 from illumgrid.field.builtin import SCENES
 from illumgrid.field.diagnosis import critical_isovalues, diagnose, topology, turning
+from illumgrid.field.filters import smooth
 from illumgrid.field.plateaus import plateaus
 from illumgrid.field.scene import Field
-from illumgrid.field.volume import Volume, interpolate, smooth, world_to_index
+from illumgrid.field.volume import Volume, interpolate, world_to_index
 from illumgrid.grid import GridSpec
 from shapes import DIRECTIONS, ball, sampled
 

@@ -14,12 +14,13 @@ from illumgrid.field import bricks, levelset
 from illumgrid.field.boundaries import suggest_magnitudes, suggest_range
 from illumgrid.field.coarse import block_means
 from illumgrid.field.diagnosis import critical_isovalues, diagnose, turning
+from illumgrid.field.filters import smooth
 from illumgrid.field.lattice import nodes_over
 from illumgrid.field.levelset import isosurface, marchable
 from illumgrid.field.plateaus import plateaus
 from illumgrid.field.scene import Field, Scene
 from illumgrid.field.storing import NATIVE
-from illumgrid.field.volume import Volume, histogram, interpolate, outward_normals, project, smooth
+from illumgrid.field.volume import Volume, histogram, interpolate, outward_normals, project
 from illumgrid.show.picture import render
 from illumgrid.show.viewer.packing import packed
 from illumgrid.transport.samples import Queries

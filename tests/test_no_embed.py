@@ -8,7 +8,8 @@ import OpenEXR
 import pytest
 
 import illumgrid as ig
-from illumgrid.field.volume import Volume, smooth
+from illumgrid.field.filters import smooth
+from illumgrid.field.volume import Volume
 from illumgrid.io import store
 from illumgrid.io.elsewhere import Source, digest, fields_again, referred
 from illumgrid.io.readers import read_volume

@@ -13,7 +13,7 @@ from illumgrid.bake import bake
 from illumgrid.field.lattice import specs_over
 from illumgrid.field.scene import level_table
 from illumgrid.interpolators.nearest import Nearest
-from illumgrid.io import partial
+from illumgrid.io import identity, partial
 from illumgrid.io.partial import Partial
 from illumgrid.samplers.direct import Direct
 from illumgrid.transport import walk
@@ -176,7 +176,7 @@ def test_a_changed_input_and_another_version_are_noticed(call, pieces, monkeypat
     pieces(3)
     call(*RUN, "--paths", "4", "-o", "out", code=130)
     pieces(-1)
-    monkeypatch.setattr(partial, "version", lambda name: "0.0.1")
+    monkeypatch.setattr(identity, "version", lambda name: "0.0.1")
     assert "versions" in call(*RUN, "--paths", "4", "-o", "out", code=2)
     call(*RUN, "--paths", "4", "-o", "out", "--any-machine")
     values = ball(10).values.copy()
@@ -263,12 +263,12 @@ def test_nodes_far_from_all_that_is_finished_are_striped():
 def test_a_digest_is_of_every_voxel_and_number(order):
     volume = ball(6)
     scene = ig.Scene.floor(volume, range=(0.3, 0.9))
-    one = partial.digest(scene)
+    one = identity.digest(scene)
     values = np.array(volume.values, order=order)
     again = ig.Volume(values.copy(order=order), volume.origin, volume.spacing)
-    before = partial.digest(again)
+    before = identity.digest(again)
     values[5, 0, 3] = np.nextafter(values[5, 0, 3], np.float32(9))
-    assert partial.digest(ig.Volume(values, volume.origin, volume.spacing)) != before
-    assert partial.digest(ig.Volume(again.values, volume.origin, volume.spacing)) == before
-    assert partial.digest(ig.Scene.floor(volume, range=(0.3, 0.9))) == one
-    assert partial.digest(ig.Scene.floor(volume, range=(0.3, 0.91))) != one
+    assert identity.digest(ig.Volume(values, volume.origin, volume.spacing)) != before
+    assert identity.digest(ig.Volume(again.values, volume.origin, volume.spacing)) == before
+    assert identity.digest(ig.Scene.floor(volume, range=(0.3, 0.9))) == one
+    assert identity.digest(ig.Scene.floor(volume, range=(0.3, 0.91))) != one

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import illumgrid as ig
-from illumgrid.field.volume import smooth
+from illumgrid.field.filters import smooth
 from illumgrid.io.readers import scene_file
 from shapes import OBLIQUE, ball, refused
 

@@ -7,8 +7,9 @@ import pytest
 
 from illumgrid.backends.numba_ import Numba
 from illumgrid.backends.reference import Reference
+from illumgrid.field.filters import smooth
 from illumgrid.field.scene import Scene
-from illumgrid.field.volume import Volume, cell_gradient, outward_normals, smooth, world_to_index
+from illumgrid.field.volume import Volume, cell_gradient, outward_normals, world_to_index
 from illumgrid.transport.samples import combine
 from transport import (
     ALBEDO,

@@ -304,6 +304,7 @@ class Illumination:
             If the folder holds a finished run and not `overwrite`, or anything that is not ours.
         """
         from illumgrid.io import store
+        from illumgrid.io.record import Stored
         from illumgrid.show import png, render
 
         store.claim(folder, overwrite)
@@ -311,5 +312,5 @@ class Illumination:
         recipe = {**self.recipe, "exposure": self.exposure}
         if self.weights:
             recipe["weights"] = dict(self.weights)
-        stored = store.Stored(self.scene, self.levels, self.grids, self.walls, recipe, source)
+        stored = Stored(self.scene, self.levels, self.grids, self.walls, recipe, source)
         store.write(folder, stored, picture, overwrite)

@@ -30,10 +30,6 @@ _MIRRORED = np.array([[2.0, -1.0, 2.0], [2.0, 2.0, -1.0], [-1.0, 2.0, 2.0]]) / 3
 _PARTS = ("id", "point", "normal", "level", "target")
 
 
-def _rgb(*light: float) -> Floats:
-    return np.array(light, float)
-
-
 def _scene() -> Scene:
     """Two balls that overlap, one solid above its isovalue and one below, over a floor and under a lamp and a sky."""
     place: dict[str, Any] = {
@@ -44,23 +40,13 @@ def _scene() -> Scene:
     index = np.indices((12, 14, 10))
     local = (index - np.array([5.5, 6.5, 4.5])[:, None, None, None]) * place["spacing"][:, None, None, None]
     radius = [np.sqrt(((local - np.array([x, 0.2, -0.1])[:, None, None, None]) ** 2).sum(axis=0)) for x in (-1.5, 2.0)]
-    above = Field(
-        "above",
-        Volume((8.0 - radius[0]).astype(np.float32), **place),
-        Material(_rgb(0.8, 0.6, 0.4)),
-        np.array([4.5, 5.5]),
-    )
-    below = Field(
-        "below",
-        Volume(radius[1].astype(np.float32), **place),
-        Material(_rgb(0.5, 0.5, 0.5)),
-        np.array([1.8, 2.8]),
-        "below",
-    )
+    solids = [Volume(values.astype(np.float32), **place) for values in (8.0 - radius[0], radius[1])]
+    above = Field("above", solids[0], Material(np.array([0.8, 0.6, 0.4])), np.array([4.5, 5.5]))
+    below = Field("below", solids[1], Material(np.full(3, 0.5)), np.array([1.8, 2.8]), "below")
     (floor,) = Scene.floor(above.volume).quads
     up = 14 * floor.normal
-    lamp = Quad("lamp", floor.corner + up, floor.edge_v, floor.edge_u, Material(_rgb(0, 0, 0), _rgb(0.5, 0.5, 0.5)))
-    return Scene((above, below), (floor, lamp), _rgb(1.0, 0.7, 0.4))
+    lamp = Quad("lamp", floor.corner + up, floor.edge_v, floor.edge_u, Material(np.zeros(3), np.full(3, 0.5)))
+    return Scene((above, below), (floor, lamp), np.array([1.0, 0.7, 0.4]))
 
 
 def _questions(scene: Scene, points: int) -> Queries:

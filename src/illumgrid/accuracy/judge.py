@@ -11,9 +11,9 @@ from illumgrid.accuracy.reference import Errors, Reference, begin, errors, look_
 from illumgrid.bake.bounces import enough_bounces
 from illumgrid.bake.walls import look_up_walls
 from illumgrid.errors import BadInput
+from illumgrid.field.filters import smooth
 from illumgrid.field.lattice import specs_over
 from illumgrid.field.scene import Scene
-from illumgrid.field.volume import smooth
 from illumgrid.grid import GridSpec, IlluminationGrid, WallTexture
 from illumgrid.rng import shifted_seed
 from illumgrid.stages import Backend

@@ -118,7 +118,10 @@ class Casting:
 
 
 def near_enough(x: Floats, d: Floats) -> Floats:
-    """Distances (n,) at which rays from outside come near [-1, 1]³, 0 where they are; inf if never: `bvh.approach`."""
+    """Distances (n,) at which rays from outside come near [-1, 1]³, 0 where they are; inf if never.
+
+    As `illumgrid.backends.mesh.traversal.approach`.
+    """
     with np.errstate(divide="ignore", invalid="ignore"):
         one, other = (-1.5 - x) / d, (1.5 - x) / d
         still = d == 0

@@ -22,8 +22,8 @@ from illumgrid.backends.lights import (
     lamp_point,
 )
 from illumgrid.backends.march import dot
-from illumgrid.backends.mesh import bvh
 from illumgrid.backends.mesh import cast as mesh_cast
+from illumgrid.backends.mesh import traversal
 from illumgrid.backends.simd import cached
 from illumgrid.backends.surfaces import begin, inside, meet_solid, solid_normal
 from illumgrid.constants import BURIED, CAP, LOST, MISS, MOST_FILMS, NOWHERE, ON_A_WALL, QUAD, SURFACE, UNSEEN
@@ -32,7 +32,7 @@ from illumgrid.rng import draw, draw_pair, mix, net_size, pascal, reverse, shari
 for _function in (mix, stream, draw, reverse, pascal, upward, draw_pair, net_size, sharing):
     register_jitable(_function)
 
-_SOURCES = gathering, lights, cubics, march, normals, simd, surfaces, bvh, mesh_cast, constants
+_SOURCES = gathering, lights, cubics, march, normals, simd, surfaces, traversal, mesh_cast, constants
 jit = cached(*_SOURCES, _nrt=False)  # as in `march`
 inlined = cached(*_SOURCES, _nrt=False, forceinline=True)
 

@@ -21,13 +21,13 @@ from illumgrid.backends.lights import (
     lamp_point,
 )
 from illumgrid.backends.march import dot
-from illumgrid.backends.mesh import bvh
 from illumgrid.backends.mesh import cast as mesh_cast
+from illumgrid.backends.mesh import traversal
 from illumgrid.backends.simd import cached
 from illumgrid.constants import BURIED, CAP, MISS, MOST_FILMS, NOWHERE, QUAD, SURFACE
 from illumgrid.rng import draw, draw_pair, stream
 
-_SOURCES = kernels, gathering, lights, cubics, march, normals, simd, surfaces, bvh, mesh_cast, constants
+_SOURCES = kernels, gathering, lights, cubics, march, normals, simd, surfaces, traversal, mesh_cast, constants
 jit = cached(*_SOURCES, _nrt=False)  # as in `march`
 
 AT_NORMAL = 0.04

@@ -70,13 +70,15 @@ def _describe_volume(source: str, limits: tuple[float, float] | None, inside: "S
     from illumgrid.errors import BadInput, shown, shown_range, tell
     from illumgrid.field.boundaries import has_both_signs, suggest_magnitudes, suggest_range
     from illumgrid.field.diagnosis import critical_isovalues, diagnose
+    from illumgrid.field.filters import finite
     from illumgrid.field.labels import around_zero
     from illumgrid.field.lattice import nodes_over
     from illumgrid.field.plateaus import plateaus
     from illumgrid.field.scene import Field
-    from illumgrid.field.volume import finite, histogram
-    from illumgrid.io import needs, store
+    from illumgrid.field.volume import histogram
+    from illumgrid.io import needs
     from illumgrid.io.readers import read_volume, volume_name
+    from illumgrid.io.record import BINS
 
     labels = labels_of(reading.pop("label", None))
     if len(labels) > 1:
@@ -84,7 +86,7 @@ def _describe_volume(source: str, limits: tuple[float, float] | None, inside: "S
     enough = None if labels or {"crop", "downsample"} & set(reading) else MOST
     volume = finite(read_volume(source, **reading, label=labels[0] if labels else None, most=enough), inside)
     needs.check("info", needs.of_field(volume.stored.size, needs.TO_DESCRIBE), "cut or --downsample the volume")
-    _describe_lattice(volume_name(source), volume, histogram(volume, store.BINS)[0].tolist(), volume.extremes)
+    _describe_lattice(volume_name(source), volume, histogram(volume, BINS)[0].tolist(), volume.extremes)
     low, high, why = suggest_range(volume, inside)
     if labels:
         (low, high), why = around_zero(volume), "a voxel outside to a voxel inside the surface of the label"
@@ -138,10 +140,11 @@ def _describe_run(source: str) -> None:
     from illumgrid.errors import shown_range
     from illumgrid.field.lattice import GridSpec
     from illumgrid.io import store
+    from illumgrid.io.record import PLACE
 
     record = store.describe(source)
     for about in record["scene"]["fields"]:
-        lattice, grid = GridSpec(*(about[key] for key in ("shape", *store.PLACE))), record["grids"][about["name"]]
+        lattice, grid = GridSpec(*(about[key] for key in ("shape", *PLACE))), record["grids"][about["name"]]
         _describe_lattice(about["name"], lattice, about["histogram"], about["extremes"], about["unit"])
         result(f"  range            {shown_range(about['range'], 6)}, inside {about['inside']}")
         nodes = " x ".join(map(str, grid["shape"]))

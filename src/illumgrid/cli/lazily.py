@@ -103,6 +103,7 @@ def go_on(place: Path, opened: bool, up: str | None) -> bool:
     from illumgrid import registry
     from illumgrid.io import partial as kept_runs
     from illumgrid.io import store
+    from illumgrid.io.identity import machine
 
     attributes = kept_runs.opened(place, "r").attrs
     about, lazy = dict(attributes["identity"]), attributes["chosen"].get("lazy")
@@ -114,7 +115,7 @@ def go_on(place: Path, opened: bool, up: str | None) -> bool:
         for kind in registry.KINDS
     }
     folder = place.with_name(place.name.removesuffix(kept_runs.SUFFIX))
-    keep = kept_runs.Partial(folder, about | kept_runs.machine(), attributes["command"])
+    keep = kept_runs.Partial(folder, about | machine(), attributes["command"])
     with reported_warnings() as sentences:
         keep.resume(None, False, False)
         numbers = {key: about[key] for key in ("grid", "paths", "bounces", "isovalues", "seed")}

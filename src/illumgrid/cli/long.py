@@ -47,7 +47,8 @@ def kept(
     """What keeps the light of a run on the way, with all that an earlier one left; None if nothing is left to do."""
     from illumgrid.constants import PATHS
     from illumgrid.io import store
-    from illumgrid.io.partial import Partial, identity
+    from illumgrid.io.identity import identity
+    from illumgrid.io.partial import Partial
 
     planned = numbers["error"] is not None or numbers["seconds"] is not None
     numbers["paths"] = None if planned else numbers["paths"] or PATHS
@@ -76,6 +77,7 @@ def _write_scene(place: Path, scene: "Scene") -> None:
     from illumgrid.field.scene import level_table
     from illumgrid.grid import GridSpec, IlluminationGrid, WallTexture
     from illumgrid.io import store
+    from illumgrid.io.record import Stored
 
     grids, walls = [], []
     for field in scene.fields:
@@ -85,7 +87,7 @@ def _write_scene(place: Path, scene: "Scene") -> None:
     for quad in scene.quads:
         none = np.zeros((2, *quad.texels[::-1]), np.float32)
         walls.append(WallTexture(none[..., None], none))
-    store.write(place, store.Stored(scene, level_table(scene, 2), tuple(grids), tuple(walls), {}), None, False)
+    store.write(place, Stored(scene, level_table(scene, 2), tuple(grids), tuple(walls), {}), None, False)
 
 
 def shared_out(stages: Mapping[str, Any], workers: int | None) -> dict[str, Any]:

@@ -121,7 +121,7 @@ def in_harmonics(scene: "Scene", lights: str | None, degree: int | None) -> "Sce
 
 
 def _smoothed(make: Callable[[], "Scene"], smooth: float) -> "Scene":
-    from illumgrid.field.volume import smooth as blur
+    from illumgrid.field.filters import smooth as blur
 
     scene = make()
     return replace(scene, fields=tuple(replace(f, volume=blur(f.volume, smooth)) for f in scene.fields))

@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from illumgrid.errors import BadInput, shown
-from illumgrid.field.volume import UPWARD, Floats, Side, Volume, finite, histogram, slabs
+from illumgrid.field.filters import finite
+from illumgrid.field.volume import UPWARD, Floats, Side, Volume, histogram, slabs
 
 _VOXELS = 1 << 22  # that are looked at, in slabs spread over the volume
 _SLAB, _MARGIN = 16, 4  # slices of a slab, and of what the blur needs around it

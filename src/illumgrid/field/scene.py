@@ -7,12 +7,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from illumgrid.errors import BadInput, shown_range
 from illumgrid.field.boundaries import suggest_range
+from illumgrid.field.filters import finite
 from illumgrid.field.lights import Light
 from illumgrid.field.quads import Material as Material
 from illumgrid.field.quads import Quad as Quad
 from illumgrid.field.quads import rgb
 from illumgrid.field.rooms import box_around, floor_under, square_texels
-from illumgrid.field.volume import UPWARD, Floats, Side, Volume, finite
+from illumgrid.field.volume import UPWARD, Floats, Side, Volume
 
 _HELD = 1e-5
 """Half the width of the range of a level that is held, as a share of the data's: nodes beside it are on it."""

@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from illumgrid.errors import BadInput
+from illumgrid.field.filters import finite, smooth
 from illumgrid.field.signed import without_gaps
-from illumgrid.field.volume import Side, Volume, finite, slabs, smooth
+from illumgrid.field.volume import Side, Volume, slabs
 from illumgrid.io.readers import read_volume
 
 

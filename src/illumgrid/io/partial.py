@@ -12,11 +12,9 @@ A finished run keeps its moments in ``moments.npz``: more paths go on from there
 import hashlib
 import json
 import os
-import pickle
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, is_dataclass
-from importlib.metadata import version
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal
@@ -26,15 +24,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from illumgrid.errors import BadInput
-from illumgrid.field.scene import Scene
 from illumgrid.grid import Channels
 from illumgrid.io import disk
+from illumgrid.io.identity import MACHINE, Record, differences, take_in
 from illumgrid.io.store import MOMENTS
 from illumgrid.samplers.direct import NodeQueries
 from illumgrid.transport.samples import Queries, Samples
 from illumgrid.transport.walk import Answer
-
-Record = dict[str, Any]
 
 FORMAT = 2  # 1 had nodes that the projection moves in another order
 EVERY = 10.0
@@ -45,76 +41,6 @@ CHUNK = 4096
 """Rows of a chunk."""
 MOMENT_ARRAYS = ("light", "spread", "paths")
 SUFFIX, LIGHT, SCENE = ".partial", "light.zarr", "scene"
-MACHINE = ("versions", "processor")
-"""What may differ where --any-machine is given: then light may differ in its last digits."""
-
-
-def digest(thing: Any) -> str:
-    """Digest of dataclasses, arrays, and what JSON has, by content."""
-    found = hashlib.sha256()
-    _hash(thing, found.update)
-    return found.hexdigest()
-
-
-def _hash(thing: Any, update: Callable[[Any], None]) -> None:
-    if is_dataclass(thing) and not isinstance(thing, type):
-        update(type(thing).__name__.encode())
-        for f in fields(thing):
-            update(f.name.encode())
-            _hash(getattr(thing, f.name), update)
-    elif isinstance(thing, np.ndarray):
-        axes = np.argsort([-abs(step) for step in thing.strides], kind="stable")  # as it lies in memory, or in its file
-        update(f"{thing.dtype.str}{thing.shape}{axes}".encode())
-        for slab in thing.transpose(axes) if thing.ndim > 1 else (thing,):
-            update(np.ascontiguousarray(slab).view(np.uint8).data)
-    elif isinstance(thing, list | tuple):
-        update(f"{len(thing)}[".encode())
-        for each in thing:
-            _hash(each, update)
-    elif thing is None or isinstance(thing, str | int | float | np.generic):
-        update(f"{type(thing).__name__} {thing!r}".encode())
-    else:
-        update(pickle.dumps(thing))
-
-
-def identity(scene: Scene, stages: Mapping[str, Any], **asked: float | None) -> Record:
-    """What decides a run's light, with a digest for whatever is large.
-
-    Parameters
-    ----------
-    scene : Scene
-    stages : mapping
-        Sampler, backend and interpolator.
-    **asked
-        Numbers that the user gave.
-    """
-    given: Record = dict(asked)
-    for kind, stage in stages.items():
-        options = {name: value for name, value in asdict(stage).items() if name != "threads"}  # which decide no light
-        given |= {kind: {"name": stage.name, **options}}
-    given |= machine()
-    about = {f"field {field.name!r}": digest(field) for field in scene.fields}
-    surroundings = {f.name: digest(getattr(scene, f.name)) for f in fields(scene) if f.name != "fields"}
-    return dict(json.loads(json.dumps({**about, **surroundings, **given})))
-
-
-def machine() -> Record:
-    """What of an identity is of this machine: `MACHINE`."""
-    from llvmlite.binding import get_host_cpu_name
-
-    versions = {name: version(name) for name in ("illumgrid", "numba", "numpy", "scipy")}
-    return {"versions": versions, "processor": get_host_cpu_name()}
-
-
-def differences(one: Record, other: Record) -> list[str]:
-    """What two runs do not have in common, in words."""
-    found = []
-    for key in sorted(one.keys() | other.keys()):
-        a, b = one.get(key), other.get(key)
-        if a != b:
-            short = all(isinstance(x, str | int | float | None) and len(str(x)) < 20 for x in (a, b))
-            found.append(f"{key} ({a}, not {b})" if short else key)
-    return found
 
 
 class Partial:
@@ -217,7 +143,7 @@ class Partial:
         self._place[order] = np.arange(len(order), dtype=self._place.dtype)
         found = hashlib.sha256()
         for queries in targets:  # the scene, whose digest is kept as well, decides where nodes are
-            _hash(queries.node if isinstance(queries, NodeQueries) else queries, found.update)
+            take_in(queries.node if isinstance(queries, NodeQueries) else queries, found.update)
         if self._asked not in ("", found.hexdigest()):
             raise BadInput(f"{self.place} is of other points than the sampler asks about now; remove it to begin anew")
         self._asked, self._last = found.hexdigest(), time.monotonic()

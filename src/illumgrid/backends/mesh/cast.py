@@ -5,15 +5,15 @@ import numpy as np
 from illumgrid import constants
 from illumgrid.backends import cubics, march, normals, simd
 from illumgrid.backends.march import dot
-from illumgrid.backends.mesh import bvh
-from illumgrid.backends.mesh.bvh import View, cast
+from illumgrid.backends.mesh import traversal
 from illumgrid.backends.mesh.meshes import Meshed
+from illumgrid.backends.mesh.traversal import View, cast
 from illumgrid.backends.normals import cell_normal, normal_by_field
 from illumgrid.backends.simd import address, cached
 from illumgrid.backends.surfaces import begin, inside, meet_solid, solid_normal
 from illumgrid.constants import BURIED, CAP, LOST, MISS, NOWHERE, SURFACE
 
-jit = cached(simd, bvh, cubics, march, normals, constants, _nrt=False)  # as in `march`
+jit = cached(simd, traversal, cubics, march, normals, constants, _nrt=False)  # as in `march`
 
 
 @jit
