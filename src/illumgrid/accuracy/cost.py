@@ -40,7 +40,8 @@ def measure_pace(
     per_path, per_node = [], []
     for number, spec in enumerate(specs):
         nodes, field = reachable(scene.fields[number], spec), scene.fields[number]
-        many = nodes[(random.integers(0, len(nodes), (128, 1)) + np.arange(64)).ravel() % len(nodes)]
+        starts = random.integers(0, len(nodes), (max(1, min(len(nodes), 1 << 13) // 64), 1))
+        many = nodes[(starts + np.arange(64)).ravel() % len(nodes)]
         asked = at_nodes(scene, number, spec, many[: max(256, about // paths)])
         tracer.solve(asked[:1], paths=range(2), bounces=bounces, seed=seed)  # loads what is compiled
         begun = time.perf_counter()
