@@ -135,6 +135,7 @@ def preview(
 ) -> None:
     """Draw an isosurface of a finished run, several side by side, or a sweep through the range."""
     from illumgrid import show
+    from illumgrid.show.cuts import clips_of
 
     given = {
         "--sweep": sweep is not None, "--isovalue": isovalue is not None, "--isovalues": isovalues is not None,
@@ -186,7 +187,7 @@ def preview(
             _write(output, picture, seen_by)
     if trust:
         _say_doubts(light)
-    if clip:
+    if clips_of(clip or (), light.scene):
         say("note: cuts show the data in grey, and the light is that of the whole solid")
     wrote = f"wrote {output}" if sweep is None else f"wrote {sweep[1]}, {sweep[0]} isovalues"
     say(wrote + ("" if local or trust else f" at exposure {light.exposure * 2**exposure:.4g}"))

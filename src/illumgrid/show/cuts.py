@@ -35,6 +35,8 @@ class Clip(NamedTuple):
 def clips_of(planes: Sequence[str], scene: Scene) -> tuple[Clip, ...]:
     """Clip planes from texts: ``"x=12.5"`` leaves out what lies beyond x = 12.5 in the world, ``"-x=12.5"`` before it.
 
+    A plane beyond which no data lie is omitted.
+
     Raises
     ------
     BadInput
@@ -43,7 +45,7 @@ def clips_of(planes: Sequence[str], scene: Scene) -> tuple[Clip, ...]:
     Warns
     -----
     IllumgridWarning
-        `clip`: of a plane beyond which no data lie.
+        `clip`: for each omitted plane.
     """
     boxes = [box_corners(field.volume) for field in scene.fields]
     found: list[Clip] = []
@@ -66,6 +68,7 @@ def clips_of(planes: Sequence[str], scene: Scene) -> tuple[Clip, ...]:
             raise BadInput(f"the clip plane {text} leaves nothing of the data; expected one that does: {where}")
         if all((box @ normal <= found[-1].offset).all() for box in boxes):
             tell("clip", f"{text} leaves nothing out, {where}", stacklevel=2)
+            found.pop()
     return tuple(found)
 
 

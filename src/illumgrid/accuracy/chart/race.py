@@ -235,7 +235,8 @@ class Race:
                 new.interpolators, new.cost, new.factor, new.ranked_by = run.interpolators, cost, factor, run.ranked_by
                 self.contestants.append(new)
 
-        if finer := [size for size in self.sizes if size > run.longest]:
+        finer = [size for size in self.sizes if size > run.longest]
+        if finer and run.grid in self.sizes:
             # Twice the nodes may halve the error, for which noise would need four times the paths: so much sooner.
             more = finer[0] / run.longest
             enter(run.method, finer[0], spent * more**3, 1 / more**2)
