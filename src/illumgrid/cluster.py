@@ -19,7 +19,7 @@ from illumgrid.errors import BadInput
 AHEAD = 3
 """Pieces of work for each thread that are on their way at a time."""
 TRIES = 5
-"""How often a piece is begun anew whose scene or answer was lost with a worker."""
+"""How often a piece is restarted whose scene or answer was lost with a worker."""
 PATIENCE = 30.0
 """Seconds to wait for a scheduler, or for its first worker."""
 

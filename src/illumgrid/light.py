@@ -57,7 +57,7 @@ class Illumination:
 
     @property
     def lights(self) -> tuple[str, ...]:
-        """Names of the lights that are kept apart, which `mix` takes."""
+        """Names of the lights that are stored separately, which `mix` takes."""
         return tuple(layer.name for layer in layers_of(self.scene))
 
     def mix(self, **weights: float) -> "Illumination":
@@ -72,7 +72,8 @@ class Illumination:
         Returns
         -------
         Illumination
-            Exposed anew. Error bars of grids are an upper bound: each light's error times its absolute weight, summed.
+            With an exposure of its own. Error bars of grids are an upper bound: each light's error times its absolute
+            weight, summed.
 
         Raises
         ------

@@ -52,7 +52,7 @@ def load(place: Path) -> tuple[Illumination, float]:
     BadInput
         If it cannot be read.
     """
-    with disk.sentences(f"{place} cannot be used", "wait for the run, or begin it anew"):
+    with disk.sentences(f"{place} cannot be used", "wait for the run, or start it again"):
         stored = store.read(place / partial.SCENE)
         kept = partial.read(place)
         about, chosen, scene = kept.attributes["identity"], kept.attributes["chosen"], stored.scene

@@ -28,7 +28,8 @@ def view(
     ] = None,
     no_open: Annotated[bool, typer.Option("--no-open", help="Print the address of the page; open no browser.")] = False,
     desktop: Annotated[
-        bool, typer.Option("--desktop", help="A PyVista window instead of a page; extracts each isosurface anew.")
+        bool,
+        typer.Option("--desktop", help="A PyVista window instead of a page; extracts every isosurface that it shows."),
     ] = False,
     weights: Weights = None,
     sky: SkyImage = None,

@@ -1,7 +1,7 @@
 """The lights of a scene as layers, and what each channel of a computation sees of them.
 
-Light is linear, so lights are kept apart: one layer for each name. All channels share their paths, and differ in the
-columns of the tables here.
+Light is linear, so each light is stored separately: one layer for each name. All channels share their paths, and
+differ in the columns of the tables here.
 """
 
 from collections.abc import Sequence

@@ -20,7 +20,7 @@ _NODES = (SIDE + 1) ** 3
 
 
 def errors_of(channels: Channels) -> list[str]:
-    """Names of the channels of a file that hold the errors of lights that are kept apart."""
+    """Names of the channels of a file that hold the errors of lights that are stored separately."""
     return [f"{name}.error" for name in channels.names] if channels.mixable else []
 
 

@@ -98,7 +98,7 @@ class Partial:
         if other:
             raise BadInput(
                 f"{self.place} holds a part of another run, which differs in {', '.join(other)}; expected the command "
-                f"that began it, {kept['command']}, or overwrite=True to begin anew"
+                f"that began it, {kept['command']}, or overwrite=True to start over"
             )
         self._lock = _locked(self.place)
         disk.kept[:] = [f"what {self.place} holds is kept"]
@@ -116,8 +116,8 @@ class Partial:
         if other := self._differences(kept["identity"], any_machine):
             self._before = {}
             raise BadInput(
-                f"{finished} holds another run, which differs in {', '.join(other)}; pass overwrite=True to begin "
-                "anew, or choose another folder"
+                f"{finished} holds another run, which differs in {', '.join(other)}; pass overwrite=True to start "
+                "over, or choose another folder"
             )
         self._asked = kept["queries"]
         self.chosen = {**kept["chosen"], "walked": [[0, int(self._before["walked"])]]}
@@ -145,7 +145,7 @@ class Partial:
         for queries in targets:  # the scene, whose digest is kept as well, decides where nodes are
             take_in(queries.node if isinstance(queries, NodeQueries) else queries, found.update)
         if self._asked not in ("", found.hexdigest()):
-            raise BadInput(f"{self.place} is of other points than the sampler asks about now; remove it to begin anew")
+            raise BadInput(f"{self.place} is of other points than the sampler asks about now; remove it to start over")
         self._asked, self._last = found.hexdigest(), time.monotonic()
 
     def known(self, paths: range) -> Answer | None:
@@ -160,7 +160,7 @@ class Partial:
             return before
         if self._group is None or name not in _ranges(self._group):
             return None
-        with disk.sentences(f"{self.place} cannot be gone on with", "remove it to begin anew"):
+        with disk.sentences(f"{self.place} cannot be gone on with", "remove it to start over"):
             part = self._group[name]
             light, spread, count = (part[key][:][self._place] for key in ("light", "spread", "paths"))
             self._stored = int((count >= 0).sum())

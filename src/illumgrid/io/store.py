@@ -108,7 +108,7 @@ def amend(folder: str | os.PathLike[str], changes: Record) -> None:
     Raises
     ------
     BadInput
-        If the record cannot be read, or written anew.
+        If the record cannot be read, or rewritten.
     """
     place = Path(os.path.abspath(folder))
     with disk.sentences(f"{folder} could not be amended", AGAIN):

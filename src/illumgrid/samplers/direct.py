@@ -69,8 +69,7 @@ class NodeQueries(Queries):
 
     They are at all nodes that a sweep can reach, or at those whose numbers are given.
 
-    Rows of it are plain queries; `point`, `normal` and `level` are computed anew, some nodes at a time, whenever they
-    are asked for.
+    Rows of it are plain queries; `point`, `normal` and `level` are computed on each access, some nodes at a time.
     """
 
     scene: Scene
@@ -112,17 +111,17 @@ class NodeQueries(Queries):
 
     @property
     def point(self) -> Floats:
-        """Computed anew."""
+        """Computed on each access."""
         return self._all("point")
 
     @property
     def normal(self) -> Floats:
-        """Computed anew."""
+        """Computed on each access."""
         return self._all("normal")
 
     @property
     def level(self) -> Floats:
-        """Computed anew."""
+        """Computed on each access."""
         return self._all("level")
 
 

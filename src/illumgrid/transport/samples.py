@@ -169,7 +169,7 @@ class Samples:
 
     @property
     def errors(self) -> NDArray[np.float32] | None:
-        """Standard error (n, C) of each channel, where lights are kept apart; else None."""
+        """Standard error (n, C) of each channel, where lights are stored separately; else None."""
         return self._stderr(self.spread) if self.channels.mixable else None
 
     @property

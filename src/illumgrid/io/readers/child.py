@@ -1,4 +1,4 @@
-"""The process that `apart` starts: it opens HDF5 or Zarr and answers requests on its input."""
+"""The process that `isolated` starts: it opens HDF5 or Zarr and answers requests on its input."""
 
 import io
 import json

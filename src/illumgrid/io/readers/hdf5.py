@@ -5,9 +5,9 @@ from importlib.util import find_spec
 import numpy as np
 
 from illumgrid.errors import BadInput
-from illumgrid.io.readers.apart import Apart, Part, apart
 from illumgrid.io.readers.arrays import three_axes
 from illumgrid.io.readers.chunked import axes_of, by_name, read_box
+from illumgrid.io.readers.isolated import Isolated, Part, isolated
 from illumgrid.io.readers.limits import check_axes
 from illumgrid.io.readers.source import Source, seekable
 from illumgrid.io.readers.stored import Note, Stored, Wanted, pick
@@ -22,7 +22,7 @@ def read(source: Source, wanted: Wanted) -> Stored:
     if source.packed:
         with seekable(source) as stream:
             packed = stream.read()
-    with apart("hdf5", source.file, packed) as file:
+    with isolated("hdf5", source.file, packed) as file:
         found = file.ask()
         if found["itk"]:
             return _by_itk(source, wanted)
@@ -44,7 +44,7 @@ def _by_itk(source: Source, wanted: Wanted) -> Stored:
     return itk.read(source, wanted)
 
 
-def _read(file: Apart, name: str, wanted: Wanted) -> Stored:
+def _read(file: Isolated, name: str, wanted: Wanted) -> Stored:
     about = file.ask(name=name)
     if about["elsewhere"]:
         raise BadInput("its numbers lie in other files; expected them in this one; copy it with h5repack")

@@ -238,7 +238,7 @@ def _numbers(attributes: dict[str, str], array: Array, count: int, appended: "_B
 
 
 class _Bytes:
-    """Bytes that may be written in base64, in runs that each begin anew."""
+    """Bytes that may be written in base64, in runs that are encoded separately."""
 
     def __init__(self, content: Any, coded: bool, at: int = 0) -> None:
         self.content, self.coded, self.at = content, coded, at

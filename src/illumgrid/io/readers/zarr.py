@@ -19,9 +19,9 @@ import numpy as np
 
 from illumgrid.errors import BadInput
 from illumgrid.field.volume import Floats
-from illumgrid.io.readers.apart import Part, apart
 from illumgrid.io.readers.arrays import three_axes
 from illumgrid.io.readers.chunked import UNITS, axes_of, by_name, read_box
+from illumgrid.io.readers.isolated import Part, isolated
 from illumgrid.io.readers.limits import check_axes
 from illumgrid.io.readers.stored import Note, Stored, Wanted, pick
 from illumgrid.io.readers.windows import Span
@@ -177,7 +177,7 @@ def _box(
     if _safe(array):
         values = read_box(array, array.chunks, order, chosen, spans)
     else:
-        with apart("zarr", Path(array.store.root)) as opened:
+        with isolated("zarr", Path(array.store.root)) as opened:
             other = Part(opened, array.path, array.shape, array.dtype, array.chunks)
             values = read_box(other, array.chunks, order, chosen, spans)
     if (there := array.nchunks_initialized) < array.nchunks:

@@ -22,7 +22,7 @@ from illumgrid.errors import BadInput
 AGAIN = "expected a whole file; copy or write it again"
 
 
-class Apart:
+class Isolated:
     """A file or folder that another process has opened."""
 
     def __init__(self, process: "subprocess.Popen[bytes]") -> None:
@@ -51,7 +51,7 @@ class Apart:
 
 
 @contextmanager
-def apart(kind: Literal["hdf5", "zarr"], place: Path, packed: bytes = b"") -> Iterator[Apart]:
+def isolated(kind: Literal["hdf5", "zarr"], place: Path, packed: bytes = b"") -> Iterator[Isolated]:
     """Open a file or folder, or the bytes of an unpacked file, in a process of its own."""
     child = [sys.executable, "-P", str(Path(__file__).with_name("child.py")), kind, str(place)]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
@@ -59,7 +59,7 @@ def apart(kind: Literal["hdf5", "zarr"], place: Path, packed: bytes = b"") -> It
         child, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, env=environment
     ) as process:
         try:
-            opened = Apart(process)
+            opened = Isolated(process)
             opened.ask(packed)
             yield opened
         finally:
@@ -69,7 +69,7 @@ def apart(kind: Literal["hdf5", "zarr"], place: Path, packed: bytes = b"") -> It
 class Part:
     """An array in another process, for `read_box`."""
 
-    def __init__(self, opened: Apart, name: str, shape: Sequence[int], dtype: Any, chunks: Sequence[int]) -> None:
+    def __init__(self, opened: Isolated, name: str, shape: Sequence[int], dtype: Any, chunks: Sequence[int]) -> None:
         self.opened, self.name, self.shape, self.dtype = opened, name, tuple(shape), np.dtype(dtype)
         self.chunks = tuple(chunks)
 
