@@ -66,7 +66,7 @@ class Partial:
         self.place = beside(folder)
         disk.sweep(self.place)  # a short run writes nothing, and would leave what killed ones left
         self.about, self.command, self.write_scene = about, command, scene
-        self.chosen: Record | None = None  # by the run that is gone on with: grid, bounces, walked...
+        self.chosen: Record | None = None  # by the run that is resumed: grid, bounces, walked...
         self.moments: list[Answer] = []
         self._before: dict[str, NDArray[Any]] = {}
         self._group: Any = None
@@ -89,7 +89,7 @@ class Partial:
         """
         if not self.place.is_dir():
             return finished is not None and self._resume_finished(finished, any_machine)
-        with disk.sentences(f"{self.place} cannot be gone on with", "remove it, or choose another folder"):
+        with disk.sentences(f"{self.place} cannot be resumed", "remove it, or choose another folder"):
             group = opened(self.place)
             kept = dict(group.attrs)
         other = self._differences(kept["identity"], any_machine)
@@ -160,7 +160,7 @@ class Partial:
             return before
         if self._group is None or name not in _ranges(self._group):
             return None
-        with disk.sentences(f"{self.place} cannot be gone on with", "remove it to start over"):
+        with disk.sentences(f"{self.place} cannot be resumed", "remove it to start over"):
             part = self._group[name]
             light, spread, count = (part[key][:][self._place] for key in ("light", "spread", "paths"))
             self._stored = int((count >= 0).sum())
