@@ -28,7 +28,7 @@ from scipy.ndimage import gaussian_filter
 
 from illumgrid import Queries, Scene, Volume, isosurface
 from illumgrid.backends.kernels import nearest_hit
-from illumgrid.backends.mesh import bvh
+from illumgrid.backends.mesh import bvh, traversal
 from illumgrid.constants import NOWHERE
 from illumgrid.field.levelset import marchable
 from illumgrid.transport.samples import in_frame
@@ -116,7 +116,7 @@ def contenders(fields, tree, embree, level, on, origin, direction):
     along_mesh, along_field = np.zeros(n), np.zeros(n)
     work = {
         "bvh": partial(
-            bvh.cast_rays, tree, bvh.stack_for(tree), start, direction, np.inf, False,
+            traversal.cast_rays, tree, bvh.stack_for(tree), start, direction, np.inf, False,
             along_mesh, np.zeros(n, np.int64), np.zeros((n, 2), np.float32),
         ),
         "marching": partial(

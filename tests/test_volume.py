@@ -4,15 +4,14 @@ import numpy as np
 import pytest
 
 from illumgrid.errors import IllumgridWarning
+from illumgrid.field.filters import finite, smooth
 from illumgrid.field.volume import (
     Volume,
     cell_gradient,
     cells,
-    finite,
     index_to_world,
     interpolate,
     outward_normals,
-    smooth,
     smooth_gradient,
     world_to_index,
 )

@@ -38,7 +38,7 @@ class Field:
     ----------
     name : str
     volume : Volume
-        Voxels that are not finite are replaced, with a warning (see `illumgrid.field.volume.finite`).
+        Voxels that are not finite are replaced, with a warning (see `illumgrid.field.filters.finite`).
     material : Material
     range : (2,) array_like, optional
         Lowest and highest isovalue of the sweep; by default those of `suggest_range`.
