@@ -342,14 +342,14 @@ def test_runs_default_under_a_sky_races_with_its_first_look_and_its_command_line
     assert default.default and default.built and default.method.looked
     own = run(scene, isovalues=2, seed=5, judge=False)
     assert default.paths == own.recipe["paths"] and default.queries == own.recipe["queries"]
-    np.testing.assert_array_equal(default.light[0], look_up(own.grids, exact.queries))
+    np.testing.assert_array_equal(default.light[0], look_up(own.grids, exact.queries)[0])
     while contestant := shown.next(np.inf):
         shown.advance(contestant)
     more = next(p for p in shown.points if p.method.looked and p.paths == 128)
     record = report.record(more, shown.references, True)
     assert report.options(record, 3) == "--backend numba --paths 128" and "first look" in record["contestant"]
     again = run(scene, backend="numba", paths=128, isovalues=2, seed=5, judge=False)
-    np.testing.assert_allclose(more.light[0], look_up(again.grids, exact.queries), rtol=1e-5)  # walked in two rounds
+    np.testing.assert_allclose(more.light[0], look_up(again.grids, exact.queries)[0], rtol=1e-5)  # walked in two rounds
     shown.repeat(np.inf, lambda: None)
     assert "nearest was" not in str(report.advice([record | {"rmse": 0.001}], PARTS, 3))
     assert "dominated" not in str(report.advice([record | {"rmse": 0.2}], PARTS, 3))
