@@ -13,6 +13,7 @@ import numba
 import numpy as np
 import pytest
 import typer
+from _pytest.assertion import rewrite
 from numba.core.dispatcher import Dispatcher
 
 import illumgrid as ig
@@ -46,8 +47,10 @@ def uncounted():
             sys.settrace(trace)
 
 
-# What is not ours to count: Numba's compiler, a third of the suite's time with coverage, and the loops of the oracle.
+# Not ours to count: the compiler of Numba, a third of the suite with coverage, what pytest makes of assertions, and the
+# loops of the oracle.
 Dispatcher.compile = uncounted()(Dispatcher.compile)
+rewrite.rewrite_asserts = uncounted()(rewrite.rewrite_asserts)
 for loops in ("path_worth", "is_hole", "solve"):
     setattr(naive, loops, uncounted()(getattr(naive, loops)))
 
