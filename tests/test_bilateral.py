@@ -193,3 +193,22 @@ def test_noise_is_averaged_and_the_bar_follows():
     bar, miss = grid.uncertainty(points), np.abs(grid.lookup(points)[:, 0] - 1)
     known = np.isfinite(bar)
     assert np.mean(miss[known] <= 1.96 * bar[known]) >= 0.93
+
+
+def test_each_of_several_layers_has_the_bar_that_it_would_have_alone():
+    from dataclasses import replace
+
+    from illumgrid.field.lights import Distant, Sky
+    from illumgrid.grid.channels import channels_of
+
+    lights = (Sky("dome", (0.2, 0.2, 0.2)), Distant("key", (-1, -1, 1), 25, (2, 2, 2)))
+    scene = replace(sky(noise(9, (8, 9, 7), seed=4), (2, 6)), lights=lights)
+    queries, nodes = asked(scene)
+    channels, random = channels_of(scene), np.random.default_rng(0)
+    light = random.random((len(queries), len(channels))).astype(np.float32)
+    m2, paths = random.random(light.shape).astype(np.float32), np.full(len(queries), 4, np.int32)
+    together = Bilateral(1.0).fill(Samples(queries, light, m2, paths, channels), nodes)
+    for k in range(len(channels)):
+        alone = Bilateral(1.0).fill(Samples(queries, light[:, k : k + 1], m2[:, k : k + 1], paths), nodes)
+        known = alone.support > 0
+        np.testing.assert_allclose(together.errors[..., k][known], alone.error[known], rtol=1e-5)

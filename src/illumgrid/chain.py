@@ -17,14 +17,15 @@ from illumgrid.accuracy.judge import judge_walls as measure_walls
 from illumgrid.accuracy.probe import FEWEST_PATHS, MOST_PATHS
 from illumgrid.bake import Baked, bake
 from illumgrid.bake.accumulator import Map, Progress
-from illumgrid.bake.ahead import Ahead, light_ahead, refinable_by
+from illumgrid.bake.ahead import Ahead, by_normal_in, light_ahead, refinable_by
 from illumgrid.bake.bounces import enough_bounces, has_long_paths, light_left_out
-from illumgrid.constants import BASE, PATHS
+from illumgrid.constants import BASE, PATHS, PATHS_BY_NORMAL
 from illumgrid.errors import BadInput, tell, tell_after
 from illumgrid.field.lattice import specs_over
 from illumgrid.field.layers import layers_of
 from illumgrid.field.scene import Levels, Scene, finer_texels, level_table, with_texels
 from illumgrid.grid import GridSpec
+from illumgrid.interpolators.bilateral import Bilateral
 from illumgrid.io import needs, store
 from illumgrid.light import Illumination
 from illumgrid.stages import Backend, Interpolator, Sampler
@@ -74,13 +75,16 @@ def run(
     ----------
     scene : Scene
     sampler, backend, interpolator : str or stage
-        Names, or stage objects such as ``illumgrid.sampler("uniform", count=64)``.
+        Names, or stage objects such as ``illumgrid.sampler("uniform", count=64)``. Without `grid` and walls, under
+        several lights, noisy data (`illumgrid.field.diagnosis.noisy`) are read by ``bilateral`` of density 1 in place
+        of ``nearest``.
     grid : int, optional
         Nodes along the axis with most voxels, all of which are lit. By default 1.2 for each voxel, at most 150; under a
         sky alone 0.85, and twice or four times as many where a first look finds rough light: see
         `illumgrid.bake.refined.chosen`.
     paths : int, optional
-        Light paths from every query; by default 32; 8 to 64 where a first look chooses the nodes.
+        Light paths from every query; by default 32; 8 to 64 where a first look chooses the nodes,
+        16 where noisy data are read by level and normal.
     bounces : int, optional
         Reflections; 0 is light straight from background and lamps. By default as many as leave out less than 1 % of
         the light, and at least 8; paths end in the light of the first look where that is known well, or, where it
@@ -149,6 +153,9 @@ def run(
     if not _shines(scene):
         tell("dark", "no background, lamp or surface of this scene emits light: all of it will be 0", stacklevel=2)
     refining = before.get("refined") if before else plan["looked"] if plan else refinable
+    by_normal = before.get("by_normal") if before else grid is None and not at_once and by_normal_in(scene, *chosen)
+    if by_normal:
+        chosen = chosen[0], chosen[1], Bilateral(1.0)
     specs = specs_over(scene, grid, BASE) if refining else specs_over(scene, grid)
     held = any(field.isovalue is not None for field in scene.fields)  # such rows are in no cache's sweep
     at_nodes = not held and (chosen[0].name, chosen[2].name) == ("direct", "nearest")
@@ -169,11 +176,11 @@ def run(
     first = {ahead.name: time.perf_counter() - clock} if ahead.name else {}
     if ahead.cached and not before:
         left_out = light_left_out(scene, ahead.tracer, bounces, seed)
-    walked = _paths_of(before, plan, paths, error, seconds, begun, ahead.paths)
+    walked = _paths_of(before, plan, paths, error, seconds, begun, PATHS_BY_NORMAL if by_normal else ahead.paths)
     if keep is not None:
         fixed = None if isinstance(walked, Iterator) else max(r.stop for r in walked)
         about = {"cache": ahead.cached, "grid": grid, "bounces": bounces, "left_out": left_out, "paths": fixed}
-        keep.choose({**about, "refined": ahead.refined, "plan": plan})
+        keep.choose({**about, "refined": ahead.refined, "by_normal": bool(by_normal), "plan": plan})
     baked = bake(
         scene, ahead.specs, levels, ahead.sampler, ahead.tracer, ahead.interpolator,
         paths=walked, bounces=bounces, seed=seed, map=map, progress=progress, keep=keep,
@@ -186,6 +193,7 @@ def run(
         "bounces": bounces,
         "left_out": left_out,
         "cache": ahead.cached,
+        "by_normal": bool(by_normal),
         "refined": ahead.refined and {"from": _longest(specs), "levels": ahead.refined["levels"]},
         "isovalues": len(levels.table),
         "seed": seed,
@@ -222,7 +230,7 @@ def _paths_of(
 ) -> Iterable[range]:  # fmt: skip
     """Numbers of the paths to walk: `few` where nothing else is said."""
     if before:
-        again = before["paths"] if before.get("refined") else PATHS
+        again = before["paths"] if before.get("refined") or before.get("by_normal") else PATHS
         return _gone_on_with(before, None if error or seconds else paths or again)
     if plan and seconds is not None and paths is None:
         return rounds(plan["paths"], plan["fill"], begun + seconds)

@@ -7,6 +7,7 @@ from typing import Any
 from illumgrid.bake.known import light_known_first
 from illumgrid.bake.refined import ROUGH, Chosen, chosen, paths_for, written
 from illumgrid.constants import PATHS
+from illumgrid.field.diagnosis import noisy
 from illumgrid.field.layers import layers_of
 from illumgrid.field.scene import Levels, Scene
 from illumgrid.grid import GridSpec
@@ -53,11 +54,24 @@ def light_ahead(
 
 
 def refinable_by(scene: Scene, sampler: Any, backend: Any, interpolator: Any) -> bool:
-    """Whether nodes can be lit where the light is rough: with the default stages, and isovalues that sweep together."""
+    """Whether nodes are lit where the light is rough: under one light, by the default stages.
+
+    In the studio, whose key casts sharp shadows, it gained little for more time.
+    """
+    return len(layers_of(scene)) == 1 and _free(scene, sampler, backend, interpolator)
+
+
+def by_normal_in(scene: Scene, sampler: Any, backend: Any, interpolator: Any) -> bool:
+    """Whether nodes are read by level and normal: noisy data under several lights, by the default stages."""
+    several = len(layers_of(scene)) > 1
+    return several and _free(scene, sampler, backend, interpolator) and all(map(noisy, scene.fields))
+
+
+def _free(scene: Scene, sampler: Any, backend: Any, interpolator: Any) -> bool:
+    """Whether a run may choose: no stage is asked for, no walls are there, and all isovalues sweep together."""
     can = capabilities(backend)
     return (
-        len(layers_of(scene)) == 1  # in the studio, whose key casts sharp shadows, it gained little for more time
-        and not scene.quads
+        not scene.quads
         and (sampler.name, interpolator.name) == ("direct", "nearest")
         and can.transport
         and can.surface == "levelset"

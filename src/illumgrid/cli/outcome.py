@@ -79,7 +79,7 @@ def _advise(light: "Illumination", stages: dict[str, Any]) -> None:
     if (stages["sampler"].name, stages["interpolator"].name) != ("direct", "nearest") or not recipe["reached"]:
         return
     noise = max((e or 0.0 for e in recipe["relative_error"]), default=0.0)
-    if recipe["reached"] < max(0.05, 1.5 * noise):
+    if recipe["reached"] < max(0.05, 1.5 * noise) or recipe.get("by_normal"):  # noisy data: said before the run
         return
     specs = [grid.spec for grid in light.grids]
     try:
@@ -113,7 +113,8 @@ def report(light: "Illumination", folder: Path, picture: bool) -> None:
 
     recipe = light.recipe
     errors = [e for e in recipe["relative_error"] if e is not None]
-    noise = f", noise about {max(errors):.1%} of the mean light" if errors else ""
+    what = "error bars" if recipe.get("by_normal") else "noise"
+    noise = f", {what} about {max(errors):.1%} of the mean light" if errors else ""
     plan, reached = recipe["plan"], recipe["reached"]
     if plan:
         for sentence in plan["why"]:
@@ -124,6 +125,8 @@ def report(light: "Illumination", folder: Path, picture: bool) -> None:
             f"{refined['from']} nodes along the longest axis are lit"
             + (f", and up to {recipe['grid']} where the light is rough" if refined["levels"] else "")
         )
+    if recipe.get("by_normal"):
+        say("nodes are read by level and normal, since the data are noisy; --grid N reads N nodes one by one")
     if recipe.get("cache"):
         say(f"paths end in light that is known: a bias of at most {MOST_BIAS:.1%} of the mean light on tested scenes")
     if recipe["texels"]:

@@ -73,7 +73,10 @@ def run(
     ] = False,
     backend: Annotated[str, typer.Option(help="Light transport: auto, numba, embree, reference.")] = "auto",
     paths: Annotated[
-        int | None, typer.Option(min=1, metavar="N", help="Paths from every query. [default: 32; sky alone: 8 to 64]")
+        int | None,
+        typer.Option(
+            min=1, metavar="N", help="Paths from every query. [default: 32; sky alone: 8 to 64; noisy data: 16]"
+        ),
     ] = None,
     bounces: Annotated[
         int | None,
@@ -84,7 +87,9 @@ def run(
         ),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, max=2**64 - 1, metavar="N", help="Equal seeds give equal light.")] = 0,
-    interpolator: Annotated[str, typer.Option(help="nearest, bilateral, splat or rbf.")] = "nearest",
+    interpolator: Annotated[
+        str, typer.Option(help="nearest, bilateral, splat or rbf. Noisy data in the studio: bilateral.")
+    ] = "nearest",
     grid: Annotated[
         int | None,
         typer.Option(min=2, metavar="N", help="Nodes along the longest axis. [default: 1.2 per voxel, at most 150]"),

@@ -29,6 +29,7 @@ _BLOCK = 64  # voxels along a block of those
 _ENOUGH = 1 << 20  # pairs of voxels whose normals are compared
 
 _ROUGH = 0.5  # normals that turn this much from voxel to voxel are rough (see `turning`)
+_NOISY = 0.7  # reading by level and normal pays in the studio: lost at 0.61, won at 0.85 (docs/interpolators.md)
 _BLURS = (1.0, 1.5, 2.0, 3.0, 4.0)  # voxels; the first that leaves no rough normals is advised
 _SOOTHED = 0.8  # ... and if a blur by one voxel brings them to this share, it is noise and not shape
 _FLOOR = 0.12  # over turning²; within a factor of two on raw and blurred volumes of ten kinds (docs/stability.md)
@@ -80,6 +81,14 @@ def turning(volume: Volume, low: float, high: float, blur: float = 0.0) -> float
         if pairs >= _ENOUGH and not small:
             break
     return float(np.sqrt(total / pairs)) if pairs else 0.0
+
+
+def noisy(field: Field) -> bool:
+    """Whether the normals of the swept level sets turn so much that nodes are better read by level and normal.
+
+    Beside a surface of such data lie nodes whose own level sets are noise, with other normals and shadows of their own.
+    """
+    return turning(field.volume, *field.stored_range) >= _NOISY
 
 
 def _slabs_of(shape: tuple[int, int, int]) -> Iterator[tuple[slice, ...]]:

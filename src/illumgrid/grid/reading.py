@@ -173,8 +173,9 @@ def fit(place, light, u, count, weights, near, system, right):
 
 @jit
 def estimate(
-    start, column, place, light, variance, shape, u, level, normal, exponents, weights, near, system, right, found
-):
+    start, column, place, light, variance, each, shape, u, level, normal, exponents, weights, near, system, right,
+    found, bars,
+):  # fmt: skip
     """Light at index u of the lit lattice, for a surface of this level and normal, from the samples around it.
 
     Samples lie in the order of the nodes that they are next to: `start` (rows + 1,) is where each row of nodes along
@@ -186,7 +187,8 @@ def estimate(
     the value is that of the linear function of position which fits best (moving least squares, a ridge on its slope),
     held within the range of the samples. A steep sample is near to more levels: divided by its slope, the weight is the
     same in sum over all levels, or steep places, which are brighter on rough fields, would be preferred. Fills found
-    (C,); returns variance and number of samples, 0 if none is near.
+    (C,); returns variance and number of samples, 0 if none is near. Where channels are mixed later, `each` (m, C) is
+    the variance of every channel of the samples, and bars[0] becomes that of the answer; else both have no columns.
 
     The variance is Σ a² σ² of the samples' noise, a their weights in the fit, and (1 + Σ a²) s², s² being by how much
     more than noise the samples around scatter about the fit: the light at the point does so too.
@@ -196,6 +198,7 @@ def estimate(
         return np.inf, 0.0
     total = fit(place, light, u, count, weights, near, system, right)
     scatter, own, spread, noise, squares = 0.0, 0.0, 0.0, 0.0, 0.0
+    bars[:] = 0.0
     for j in range(count):
         i, weight = near[j], weights[j]
         x, y, z = place[i, 0] - u[0], place[i, 1] - u[1], place[i, 2] - u[2]
@@ -207,14 +210,22 @@ def estimate(
         for k in range(channels):
             miss = light[i, k] - right[0, k] - right[1, k] * x - right[2, k] * y - right[3, k] * z
             scatter += weight * miss * miss / channels
+            if k < bars.shape[1]:
+                bars[0, k] += share * share * each[i, k]
+                bars[1, k] += weight * miss * miss
+                bars[2, k] += weight * each[i, k]
     for k in range(channels):
         lowest, highest = np.inf, -np.inf
         for j in range(count):
             lowest, highest = min(lowest, light[near[j], k]), max(highest, light[near[j], k])
         found[k] = min(max(right[0, k], lowest), highest)
     if not noise < np.inf:
+        bars[0] = np.inf
         return np.inf, 1.0 / spread
     alike = total * total / squares
+    free = alike / max(alike - 1.0, 0.5) / total
+    for k in range(bars.shape[1]):
+        bars[0, k] += max(0.0, bars[1, k] * free - bars[2, k] / total) * (1.0 + spread)
     misfit = max(0.0, scatter / total * alike / max(alike - 1.0, 0.5) - noise / total)
     return own + misfit * (1.0 + spread), 1.0 / spread
 
@@ -232,22 +243,24 @@ def fill(
     place,
     light,
     variance,
+    each,
     dark,
     shape,
     ratio,
     x,
     out,
     error,
+    errors,
     support,
 ):
-    """Fill light (n, C), error and support (n,) at nodes in voxel coordinates x (n, 3).
+    """Fill light (n, C), error and support (n,) at nodes in voxel coordinates x (n, 3), and `errors` of each channel.
 
     A node whose value lies beyond the `ends` of the range reads at the nearest end, where the gradient leads to it. u
     is x times `ratio`; `dark` are the flat numbers, in order, of the nodes of the lit lattice that are holes.
     """
     exponents, weights, near = np.empty(MOST), np.empty(MOST), np.empty(MOST, np.int64)
     system, right = np.empty((4, 4)), np.empty((4, light.shape[1] + 1))
-    found = np.zeros(light.shape[1])
+    found, bars = np.zeros(light.shape[1]), np.zeros((3, errors.shape[1]))
     for i in range(len(x)):
         a, b, c = x[i, 0], x[i, 1], x[i, 2]
         node = int(np.round(a * ratio[0])), int(np.round(b * ratio[1])), int(np.round(c * ratio[2]))
@@ -277,10 +290,12 @@ def fill(
         if steep == 0.0:
             continue
         square, count = estimate(
-            start, column, place, light, variance, shape, (a * ratio[0], b * ratio[1], c * ratio[2]),
-            (level - shift) * scale, (nx, ny, nz), exponents, weights, near, system, right, found,
+            start, column, place, light, variance, each, shape, (a * ratio[0], b * ratio[1], c * ratio[2]),
+            (level - shift) * scale, (nx, ny, nz), exponents, weights, near, system, right, found, bars,
         )  # fmt: skip
         if count > 0.0:
             error[i], support[i] = np.sqrt(square), count
             for k in range(light.shape[1]):
                 out[i, k] = found[k]
+            for k in range(errors.shape[1]):
+                errors[i, k] = np.sqrt(bars[0, k])

@@ -28,6 +28,7 @@ class Bins(NamedTuple):
     place: NDArray[np.float32]  # (m, 8): see `illumgrid.grid.reading.estimate`
     light: NDArray[np.float32]  # (m, C)
     variance: NDArray[np.float32]  # (m,)
+    each: NDArray[np.float32]  # (m, C) of each channel where they are mixed later, else (m, 0)
     dark: NDArray[np.int64]  # flat numbers of the holes of the lit lattice, in order
 
 
@@ -59,7 +60,9 @@ def bins(samples: Samples, nodes: Nodes) -> Bins:
     column = (flat[good] % nz).astype(np.int32)
     variance = np.square(samples.error[good], dtype=np.float64)
     light = np.ascontiguousarray(samples.light[good], np.float32)
-    return Bins(start, column, place.astype(np.float32), light, variance.astype(np.float32), dark)
+    own = samples.errors
+    each = np.zeros((len(good), 0), np.float32) if own is None else np.square(own[good])
+    return Bins(start, column, place.astype(np.float32), light, variance.astype(np.float32), each, dark)
 
 
 def _level_units(nodes: Nodes) -> tuple[float, float]:
@@ -99,15 +102,17 @@ class Bilateral:
         """Fill a grid of `density` times the nodes: see `illumgrid.stages.Interpolator`."""
         dense = Nodes(denser(nodes.spec, self.density), nodes.field, nodes.number)
         flat = reachable(nodes.field, dense.spec)
-        return dense.grid_of(flat, *read(samples, nodes, dense, flat), samples.channels)
+        light, error, support, errors = read(samples, nodes, dense, flat)
+        return dense.grid_of(flat, light, error, support, samples.channels, errors)
 
 
 def read(
     samples: Samples, nodes: Nodes, dense: Nodes, flat: NDArray[np.int64]
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-    """Light (n, C), error (n,) and support (n,) at the nodes (n,) of `dense` with the numbers `flat`.
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32], NDArray[np.float32] | None]:
+    """Light (n, C), error (n,) and support (n,) at the nodes (n,) of `dense` with the numbers `flat`, and `errors`.
 
-    The samples lie around `nodes`, the lattice that was lit.
+    The samples lie around `nodes`, the lattice that was lit. `errors` (n, C) are those of each channel where several
+    layers are mixed later, else None.
     """
     from illumgrid.grid.reading import fill
 
@@ -115,6 +120,7 @@ def read(
     spec, field = nodes.spec, nodes.field
     light = np.zeros((len(flat), samples.light.shape[1]), np.float32)
     error, support = np.full(len(flat), np.inf, np.float32), np.zeros(len(flat), np.float32)
+    errors = np.full((len(flat), sorted_.each.shape[1]), np.inf, np.float32)
     volume, (scale, shift) = field.volume, _level_units(nodes)
     ratio = (np.array(spec.shape) - 1.0) / (np.array(volume.shape) - 1.0)
 
@@ -123,13 +129,13 @@ def read(
         fill(
             volume.stored, volume.spacing, field.upward, field.stored_range, scale, shift, *sorted_,
             np.array(spec.shape), ratio, np.stack(index, axis=1) * (dense.spec.spacing / volume.spacing),
-            light[some], error[some], support[some],
+            light[some], error[some], errors[some], support[some],
         )  # fmt: skip
 
     chunk(slice(0, 0))  # compiles once, in the main thread, which Ctrl-C interrupts
     with ThreadPoolExecutor(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else None) as pool:
         list(pool.map(chunk, (slice(i, i + _BLOCK) for i in range(0, len(flat), _BLOCK))))
-    return light, error, support
+    return light, error, support, errors if errors.shape[1] else None
 
 
 def denser(spec: GridSpec, density: float) -> GridSpec:

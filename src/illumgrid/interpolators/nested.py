@@ -82,7 +82,7 @@ def _level(
         between = answer(held.layout, held.light, bars, held.support, layout.place(some))
         for array, here in zip((light, error, support), between):
             array[some] = here.reshape(-1, *array.shape[1:])
-    found = read(samples, own, own, np.ravel_multi_index(tuple((place[mine] // step).T), own.spec.shape))
+    found = read(samples, own, own, np.ravel_multi_index(tuple((place[mine] // step).T), own.spec.shape))[:3]
     lit, low, high = found[2] > 0, *nodes.field.range
     isovalue = samples.queries[mine].level[:, nodes.number]
     hole = mine[~lit & (isovalue > low) & (isovalue < high)]  # shows what is between its neighbours
@@ -96,7 +96,7 @@ def _coarsest(samples: Samples, place: NDArray[np.int64], nodes: Nodes, own: Nod
     from scipy.spatial import KDTree
 
     flat = np.ravel_multi_index(tuple((place // step).T), own.spec.shape)
-    light, error, support = read(samples, own, own, flat)
+    light, error, support, _ = read(samples, own, own, flat)
     dark, lit = np.flatnonzero(support == 0), np.flatnonzero(samples.paths > 0)
     if len(dark) and len(lit):  # at the rim, without a point of their own: the light of the nearest sample
         tree = KDTree(samples.queries.point[lit] - own.spec.origin)
