@@ -186,24 +186,9 @@ def run(
         paths=walked, bounces=bounces, seed=seed, map=map, progress=progress, keep=keep,
     )  # fmt: skip
     _note_holes(scene, baked)
-    stages = chosen[0], chosen[1], ahead.interpolator
-    recipe = {
-        **{kind: _described(stage) for kind, stage in zip(("sampler", "backend", "interpolator"), stages)},
-        "grid": _longest(ahead.specs),
-        "bounces": bounces,
-        "left_out": left_out,
-        "cache": ahead.cached,
-        "by_normal": bool(by_normal),
-        "refined": ahead.refined and {"from": _longest(specs), "levels": ahead.refined["levels"]},
-        "isovalues": len(levels.table),
-        "seed": seed,
-        **_measured(baked, first),
-        "plan": plan,
-        "reached": None,
-        "reached_uncertain": None,
-        "reached_on_walls": None,
-        "versions": {name: version(name) for name in ("illumgrid", "numpy", "numba", "scipy")},
-    }
+    said = {"bounces": bounces, "left_out": left_out, "by_normal": bool(by_normal), "seed": seed, "plan": plan}
+    said["isovalues"] = len(levels.table)
+    recipe = {**_chosen(chosen, ahead, specs), **said, **_measured(baked, first)}
     light = Illumination(scene, levels, baked.grids, baked.walls, recipe)
     return judged(light, chosen[1], tracer) if judge else light
 
@@ -272,6 +257,17 @@ def _note_holes(scene: Scene, baked: Baked) -> None:
             )
 
 
+def _chosen(stages: Sequence[Any], ahead: Ahead, looked_at: Sequence[GridSpec]) -> dict[str, Any]:
+    """What the recipe says about the stages and the nodes, which a first look at a lattice may have chosen."""
+    kinds = zip(("sampler", "backend", "interpolator"), (*stages[:2], ahead.interpolator))
+    return {
+        **{kind: _described(stage) for kind, stage in kinds},
+        "grid": _longest(ahead.specs),
+        "cache": ahead.cached,
+        "refined": ahead.refined and {"from": _longest(looked_at), "levels": ahead.refined["levels"]},
+    }
+
+
 def _measured(baked: Baked, first: dict[str, float]) -> dict[str, Any]:
     """What the recipe says about how the light came about; `first` is the time of what came before the bake."""
     return {
@@ -282,6 +278,8 @@ def _measured(baked: Baked, first: dict[str, float]) -> dict[str, Any]:
         "holes": list(baked.holes),
         "seconds": {stage: round(seconds, 3) for stage, seconds in {**first, **baked.seconds}.items()},
         "relative_error": [grid.relative_error for grid in baked.grids],
+        **dict.fromkeys(("reached", "reached_uncertain", "reached_on_walls")),  # not judged
+        "versions": {name: version(name) for name in ("illumgrid", "numpy", "numba", "scipy")},
     }
 
 
