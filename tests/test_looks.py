@@ -45,6 +45,17 @@ def test_a_mirror_shows_fresnels_share_of_the_sky():
     assert seen.sum() > 200 and np.allclose(found[seen], truth[:, None], rtol=0.02)
 
 
+@pytest.mark.parametrize("lights", ["one grey", "one of a colour", "two grey"])
+def test_coats_reflect_lights_at_their_weights(lights):
+    scene = replace(sky(ball(12), albedo=BLACK), background=np.array((1, 0.5 if "colour" in lights else 1, 1)))
+    if "two" in lights:
+        scene = replace(scene, lights=(ig.Distant("sun", (0, 0, 1), 10.0, (1, 1, 1)),))
+    light = ig.run(scene, grid=4, isovalues=2, paths=1, bounces=0, judge=False)
+    dark = {"sun": 0.0} if "two" in lights else {}
+    whole, dim = (coat_of(light.mix(sky=share, **dark), 0.0)[0] for share in (1.0, 0.25))
+    assert whole.max() > 0.1 and np.allclose(dim, 0.25 * whole, rtol=1e-4)
+
+
 def test_rays_and_lights_that_are_asked_add_up_to_the_lobe():
     """A rough coat under a soft disc of the sky: by quadrature of GGX over the disc."""
     sun = ig.Distant("sun", (0.4, -1.0, 0.7), 20.0, (1, 1, 1))

@@ -18,7 +18,7 @@ from illumgrid.field.scene import Material, Scene
 from illumgrid.field.volume import Floats
 from illumgrid.grid import IlluminationGrid
 from illumgrid.grid.cache import Cache
-from illumgrid.grid.channels import columns_of
+from illumgrid.grid.channels import channels_of, columns_of
 from illumgrid.light import Illumination
 from illumgrid.show.cuts import clipped_layers
 
@@ -75,10 +75,10 @@ def sight_of(shown: "Shown") -> Sight:
 
 def _lit(light: Illumination, scene: Scene) -> Marchable:
     """The scene for marching, its lights at the weights of the light."""
-    laid, channels, columns = marchable(scene), light.grids[0].channels, columns_of(light.scene)
-    if not light.weights or channels.names != tuple(column.name for column in columns):
+    laid, channels = marchable(scene), light.grids[0].channels
+    if not light.weights or channels.names != channels_of(light.scene).names:
         return laid
-    tables, mix = light_tables(scene, columns), np.array(channels.mix)
+    tables, mix = light_tables(scene, columns_of(light.scene)), np.array(channels.mix)
     names = "emission", "background", "usual", "harmonics", "disc_radiance", "image"
     return laid._replace(**{name: np.ascontiguousarray(tables[name] @ mix) for name in names})
 
