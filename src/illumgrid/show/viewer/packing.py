@@ -4,6 +4,7 @@ Everything is placed on a *stage*: world axes, the scene's box of size about 1 a
 precision is enough for a graphics card wherever the data lie.
 """
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,8 +16,10 @@ from illumgrid.field.layers import layers_of
 from illumgrid.field.scene import Field, Scene
 from illumgrid.field.upright import axes_of, up_of
 from illumgrid.field.volume import Floats, Lattice, box_corners, histogram
+from illumgrid.grid import IlluminationGrid
 from illumgrid.grid.channels import Channels, mixed
 from illumgrid.grid.nodes import reachable
+from illumgrid.grid.walls import WallTexture
 from illumgrid.light import Illumination
 from illumgrid.show import cuts, trust
 from illumgrid.show.camera import HALF_ANGLE, fit_camera, outline_of
@@ -117,6 +120,7 @@ def _field(
     shown = pack_light(_mix(grid.channels, grid.light) * scale, error, into)
     if coming:
         shown |= {"shape": list(spec.shape), "every": STEP}
+    shown |= {"usual": _usual(light, grid), "near": float(spec.spacing.max() / stage.size)}
     if kept_apart(light):
         layers = layers_of(light.scene)
         shown["layers"] = pack_layers(grid.light * scale, grid.channels, layers, shown["channels"], into)
@@ -177,6 +181,15 @@ def _mix(channels: Channels, light: NDArray[np.float32]) -> NDArray[np.float32]:
     return channels.shown(light) if channels.own else np.asarray(light @ np.array(channels.mix, np.float32))
 
 
+def _usual(light: Illumination, held: IlluminationGrid | WallTexture) -> list[float]:
+    """Exposed mean light of what has light of its own; where lights are kept apart, of each at weight 1."""
+    apart, lit = kept_apart(light), held.light[held.support > 0]
+    mixes = [{name: float(name == one) for name in apart} for one in apart]
+    shown = [mixed(held.channels, layers_of(light.scene), weights) for weights in mixes] or [held.channels]
+    found = [channels.shown(lit).mean(dtype=float) if len(lit) else 0.0 for channels in shown]
+    return [light.exposure / np.pi * float(mean) for mean in found]
+
+
 def _note_lost(notes: list[str], name: str, kept: int, of: int, lost: float) -> None:
     if lost:
         notes.append(
@@ -212,6 +225,8 @@ def _walls(light: Illumination, stage: Stage, into: Bytes) -> tuple[list[dict[st
                 "edgeV": (quad.edge_v / stage.size).tolist(),
                 "normal": quad.normal.tolist(),
                 "texels": [nu, nv],
+                "near": max(math.hypot(*quad.edge_u) / nu, math.hypot(*quad.edge_v) / nv) / stage.size,
+                "usual": _usual(light, light.walls[number]),
                 "fades": fades(light.scene, number),
                 "offset": [offset, 0],
                 "albedo": material.albedo.tolist(),
@@ -221,7 +236,8 @@ def _walls(light: Illumination, stage: Stage, into: Bytes) -> tuple[list[dict[st
         )
         offset += nu
     shown = _beside([_mix(wall.channels, wall.light) for wall in light.walls]) * scale
-    atlas = pack_light(shown, np.zeros(shown.shape[:3]), into)
+    own = _beside([(wall.support > 0)[..., None].astype(np.float32) for wall in light.walls])[..., 0]
+    atlas = pack_light(shown, np.where(own > 0, 0.0, HOLE), into)
     if kept_apart(light):
         layers, channels = _beside([wall.light for wall in light.walls]) * scale, light.walls[0].channels
         atlas["layers"] = pack_layers(layers, channels, layers_of(light.scene), atlas["channels"], into)

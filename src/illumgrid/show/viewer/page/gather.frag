@@ -3,7 +3,7 @@ uniform float uId;
 
 void main() {
   Ray ray = gathered();
-  if (ray.id < 0.0 || ray.worth <= 0.0) discard;
+  if (ray.id < 0.0 || most(ray.worth) <= 0.0) discard;
   vec3 start = (uToIndex * vec4(ray.start, 1.0)).xyz, ahead = mat3(uToIndex) * ray.ahead;
   int what = SURFACE;
   float t = 0.0;
@@ -21,5 +21,11 @@ void main() {
   if (what == NOTHING || t >= ray.reach) discard;
   gl_FragDepth = depthOf(t);
   vec3 texel = (uToTexture * vec4(ray.start + t * ray.ahead, 1.0)).xyz;
+  if (uAim == OPEN && !uOnward && !uBothSides && what == SURFACE && (t < uNear || !trusted(uLight, texel * vec3(textureSize(uLight, 0)) - 0.5, ivec3(0), textureSize(uLight, 0) - 1))) {
+    place_ = vec4(ray.start + t * ray.ahead, uId);
+    normal_ = vec4(-normalize(transpose(mat3(uToIndex)) * gradient(start + t * ahead)), 0.0);
+    color_ = vec4(0.0);
+    return;
+  }
   color_ = vec4(uAim == OPEN || uAim == MIRROR ? ray.worth * uAlbedo * lightOf(texture(uLight, texel)) : vec3(0.0), 1.0);
 }

@@ -13,8 +13,14 @@ uniform sampler2D uImage;            // of the sky: radiance as the exposure sho
 uniform float uSoft;                 // mean colour up to which escaping rays find a pixel; what is above it is asked for
 uniform vec3 uSkyAxes[3];            // right, back and up
 uniform float uCoats[16];            // roughness of each surface's coat, below 0 without
+uniform bool uOnward;                // from where the first ray ended too soon: this one ends where it lands
+uniform float uKept[48];             // albedos of the surfaces, three numbers each
+uniform float uNear, uAlike;         // shortest ray that may end, and by how much nodes of one cell may differ: see illumgrid.grid.cache
 
-struct Ray { vec3 start, ahead; float id, reach, worth; };
+layout(location = 1) out vec4 place_;    // where a ray goes on that is not to end there, and its surface: -1 for none
+layout(location = 2) out vec4 normal_;
+
+struct Ray { vec3 start, ahead; float id, reach; vec3 worth; };
 
 vec4 pixel(int k, ivec2 size) { return texelFetch(uImage, ivec2(k % size.x, k / size.x), 0); }
 float bright(vec3 light) { return dot(light, vec3(1.0 / 3.0)); }
@@ -61,7 +67,21 @@ void toImage(inout Ray ray, vec3 normal, vec2 u) {
   ray.ahead = cos(up) * (sin(azimuth) * uSkyAxes[0] + cos(azimuth) * uSkyAxes[1]) + sin(up) * uSkyAxes[2];
   vec3 soft, hard;
   image(place, soft, hard, asked);
-  ray.worth = max(dot(ray.ahead, normal), 0.0) * cos(up) * 6.2831853 / float(size.x * size.y) * total / max(asked, 1e-20);
+  ray.worth *= max(dot(ray.ahead, normal), 0.0) * cos(up) * 6.2831853 / float(size.x * size.y) * total / max(asked, 1e-20);
+}
+
+// Whether a ray may end between these nodes of light, which lie from `first` to `last`.
+bool trusted(sampler3D lights, vec3 node, ivec3 first, ivec3 last) {
+  ivec3 cell = ivec3(clamp(node, vec3(first), vec3(last)));
+  float low = 1e9, high = 0.0;
+  for (int k = 0; k < 8; k++) {
+    vec4 texel = texelFetch(lights, min(cell + ivec3(k & 1, (k >> 1) & 1, k >> 2), last), 0);
+    if (errorOf(texel) < 0.0) return false;
+    float light = bright(lightOf(texel));
+    low = min(low, light);
+    high = max(high, light);
+  }
+  return high - low <= uAlike;
 }
 
 // J. Jimenez, "Next generation post processing in Call of Duty", SIGGRAPH 2014: near pixels differ most.
@@ -86,7 +106,7 @@ void mirror(inout Ray ray, vec3 n, float rough, vec2 u) {
   vec3 d = 2.0 * dot(v, h) * h - v;
   float to = 0.5 * (sqrt(1.0 + alpha * alpha * (1.0 / (v.z * v.z) - 1.0)) - 1.0), from = 0.5 * (sqrt(1.0 + alpha * alpha * (1.0 / max(d.z * d.z, 1e-6) - 1.0)) - 1.0);
   ray.ahead = d.x * a + d.y * b + d.z * n;
-  ray.worth = d.z > 0.0 ? (0.04 + 0.96 * pow(1.0 - clamp(dot(v, h), 0.0, 1.0), 5.0)) * (1.0 + to) / (1.0 + to + from) : 0.0;
+  ray.worth *= d.z > 0.0 ? (0.04 + 0.96 * pow(1.0 - clamp(dot(v, h), 0.0, 1.0), 5.0)) * (1.0 + to) / (1.0 + to + from) : 0.0;
 }
 
 // `worth` turns the radiance that the ray finds into light of the origin, in the units of the light's textures.
@@ -94,25 +114,27 @@ Ray gathered() {
   vec4 place = texelFetch(uPlace, ivec2(gl_FragCoord.xy), 0);
   vec3 normal = texelFetch(uNormals, ivec2(gl_FragCoord.xy), 0).xyz, a, b;
   vec2 shift = gl_FragCoord.xy + 31.0 * float(uAim), u = fract(uTurn + vec2(noise(shift), noise(shift + 39.117666)));
-  Ray ray = Ray(place.xyz, normal, place.w, 1e9, 1.0);
+  Ray ray = Ray(place.xyz, normal, place.w, 1e9, vec3(1.0));
+  if (uOnward && ray.id >= 0.0) ray.worth = vec3(uKept[3 * int(ray.id)], uKept[3 * int(ray.id) + 1], uKept[3 * int(ray.id) + 2]);
+  place_ = vec4(0.0, 0.0, 0.0, -1.0);
+  normal_ = vec4(0.0);
   float angle = 6.2831853 * u.y;
   if (uAim == LAMP) {
     vec3 to = uLamp0 + u.x * uLampU + u.y * uLampV - place.xyz;
     float far = length(to);
     ray.ahead = to / far;
     ray.reach = far;
-    ray.worth = max(dot(ray.ahead, normal), 0.0) * max(-dot(ray.ahead, uLampNormal), 0.0) * length(cross(uLampU, uLampV)) / (3.14159265 * far * far);
+    ray.worth *= max(dot(ray.ahead, normal), 0.0) * max(-dot(ray.ahead, uLampNormal), 0.0) * length(cross(uLampU, uLampV)) / (3.14159265 * far * far);
   } else if (uAim == DISC) {
     float cosine = mix(1.0, uCosine, u.x), sine = sqrt(max(0.0, 1.0 - cosine * cosine));
     basisOf(uAxis, a, b);
     ray.ahead = sine * (cos(angle) * a + sin(angle) * b) + cosine * uAxis;
-    ray.worth = 2.0 * (1.0 - uCosine) * max(dot(ray.ahead, normal), 0.0);
+    ray.worth *= 2.0 * (1.0 - uCosine) * max(dot(ray.ahead, normal), 0.0);
   } else if (uAim == IMAGE) {
     toImage(ray, normal, u);
   } else if (uAim == MIRROR) {
     float rough = ray.id < 0.0 ? -1.0 : uCoats[int(ray.id)];
-    ray.worth = 0.0;
-    if (rough >= 0.0) mirror(ray, normal, rough, u);
+    if (rough >= 0.0) mirror(ray, normal, rough, u); else ray.worth = vec3(0.0);
   } else {
     float sine = sqrt(u.x);
     basisOf(normal, a, b);

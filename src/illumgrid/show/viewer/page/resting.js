@@ -1,5 +1,6 @@
 // While nothing moves, rays from every pixel gather light; see gather.glsl. A ray ends where it meets a surface, in the
-// light that is stored there, so that few suffice; until there are enough, the picture is mostly that of the lookup.
+// light that is stored there, so that few suffice; where that is not to be trusted, or near, it is reflected once more.
+// Until there are enough rays, the picture is mostly that of the lookup.
 
 import { dot, sum } from "./camera.js";
 import { skyTexels } from "./numbers.js";
@@ -16,7 +17,9 @@ const TRIAL = [96, 72], RAYS = 8; // pixels, and rays from each in either half o
 const ENOUGH = 64; // pixels on which a surface is judged by itself
 const BAND = 30; // milliseconds for a part of a slow picture
 const FAR = 100;
+const ALIKE = 0.3; // as in illumgrid.grid.cache
 const OPEN = 0, DISC = 1, LAMP = 2, MIRROR = 3, IMAGE = 4;
+const ROBERTS_2 = [0.7548776662466927, 0.5698402909980532], ROBERTS_4 = [0.8566748838545029, 0.6287067210378087]; // Roberts' sequences of two and four dimensions
 const SHINY = 0.35; // roughness of the shiny look
 
 // Sum of variances, the few that are far above the others taken for FAR times their median.
@@ -52,7 +55,8 @@ export class Resting {
     return {
       width, height,
       origin: picture.target(width, height, true, [single, single, gl.RGBA16F]),
-      ray: picture.target(width, height, true),
+      ray: picture.target(width, height, true, [gl.RGBA16F, single, single]),
+      onward: picture.target(width, height, true),
       found: picture.target(width, height, false),
       mirror: picture.target(width, height, false),
       means: [0, 1].map(() => picture.target(width, height, false, [single, single])),
@@ -63,7 +67,7 @@ export class Resting {
   begin(state, width, height, took) {
     const { picture } = this, size = String([width, height]);
     if (this.size !== size) {
-      if (this.whole) [this.whole.origin, this.whole.ray, this.whole.found, this.whole.mirror, ...this.whole.means, this.raw, this.colors].forEach((old) => picture.drop(old));
+      if (this.whole) [this.whole.origin, this.whole.ray, this.whole.onward, this.whole.found, this.whole.mirror, ...this.whole.means, this.raw, this.colors].forEach((old) => picture.drop(old));
       Object.assign(this, { size, whole: this.targets(width, height), raw: picture.target(width, height, false), colors: picture.target(width, height, false), key: "" });
     }
     const places = PLACES.slice(0, 4);
@@ -215,8 +219,9 @@ export class Resting {
     gl.viewport(0, 0, width, height);
     const seen = { ...picture.seen(state, width, height, place), uRoll: ((first + count) * 0.7548776662466927) % 1, uLook: LOOKS.indexOf(state.look), uClip: picture.clip(state) };
     const coats = { "uCoats[0]": this.coats(state), uEyeAt: seen.uEye };
-    const fields = scene.fields.map((field, k) => ({ ...picture.fieldUniforms(field, k, state), uId: k }));
-    const walls = scene.walls.map((wall, k) => ({ ...picture.wallUniforms(wall, state), uId: scene.fields.length + k }));
+    const usual = ({ usual: each }) => (scene.lights.length ? each.reduce((total, mean, k) => total + mean * state.weights[k], 0) : each[0]); // mean light
+    const fields = scene.fields.map((field, k) => ({ ...picture.fieldUniforms(field, k, state), uId: k, uNear: field.light.near, uAlike: ALIKE * usual(field.light) }));
+    const walls = scene.walls.map((wall, k) => ({ ...picture.wallUniforms(wall, state), uId: scene.fields.length + k, uNear: wall.near, uAlike: ALIKE * usual(wall) }));
     const draw = (made, uniforms, kind = gl.TRIANGLES, vertices = 3) => {
       gl.useProgram(made.built);
       set(gl, made, uniforms);
@@ -234,19 +239,27 @@ export class Resting {
     walls.forEach((own, k) => {
       if (dot(own.uNormal, sum([1, seen.uEye], [-1, own.uCorner])) > 0) draw(programs.originWall, { ...seen, ...own, ...picture.wallTextures() }, gl.TRIANGLE_STRIP, 4);
     });
-    clear(into.mirror, false, 0);
-    clear(into.found, false, 0);
     const number = first + count, flat = { uForward: [0, 0, 1], uRight: [1, 0, 0], uUp: [0, 1, 0], uJitter: [0, 0] };
-    for (const aim of this.aims(state)) {
-      const ray = { ...flat, ...aim, ...coats, uRoll: seen.uRoll, uLook: 0, "uSkyAxes[0]": scene.resting.axes.flat(), uSoft: this.image?.soft ?? 0, uTurn: [0.7548776662466927, 0.5698402909980532].map((x) => (0.5 + number * x) % 1) };
-      const origins = () => ({ uPlace: picture.bind(3, gl.TEXTURE_2D, into.origin.colors[0]), uNormals: picture.bind(4, gl.TEXTURE_2D, into.origin.colors[1]), uImage: picture.bind(5, gl.TEXTURE_2D, this.image?.texture ?? null) });
-      clear(into.ray, true, 0);
+    const turned = (steps) => steps.map((x) => (0.5 + number * x) % 1);
+    const common = { ...flat, ...coats, uRoll: seen.uRoll, uLook: 0, "uSkyAxes[0]": scene.resting.axes.flat(), uSoft: this.image?.soft ?? 0, "uKept[0]": this.surfaces.flatMap((s) => s.albedo) };
+    const cast = (aim, from, [places, normals], target, sum) => {
+      const ray = { ...common, ...aim, ...from };
+      const origins = () => ({ uPlace: picture.bind(3, gl.TEXTURE_2D, places), uNormals: picture.bind(4, gl.TEXTURE_2D, normals), uImage: picture.bind(5, gl.TEXTURE_2D, this.image?.texture ?? null) });
+      clear(target, true, -1);
       gl.depthFunc(gl.LEQUAL);
       draw(programs.sky, { ...ray, ...this.sky(state), ...origins() });
       gl.depthFunc(gl.LESS);
       fields.forEach((own, k) => draw(programs.field, { ...ray, ...own, ...picture.fieldTextures(k), ...origins() }));
       walls.forEach((own) => draw(programs.wall, { ...ray, ...own, ...picture.wallTextures(), ...origins() }));
-      picture.copy(into.ray, (aim.uAim === MIRROR ? into.mirror : into.found).frame, () => gl.blendFunc(gl.ONE, gl.ONE));
+      picture.copy(target, sum.frame, () => gl.blendFunc(gl.ONE, gl.ONE));
+    };
+    clear(into.mirror, false, 0);
+    clear(into.found, false, 0);
+    const straight = { uOnward: 0, uTurn: turned(ROBERTS_2) }, onward = { uOnward: 1, uTurn: turned(ROBERTS_4) };
+    for (const aim of this.aims(state)) {
+      cast(aim, straight, into.origin.colors, into.ray, aim.uAim === MIRROR ? into.mirror : into.found);
+      if (aim.uAim !== OPEN) continue;
+      for (const next of this.aims(state)) if (next.uAim !== MIRROR) cast(next, onward, into.ray.colors.slice(1), into.onward, into.found);
     }
     gl.bindFramebuffer(gl.FRAMEBUFFER, into.means[(count + 1) % 2].frame);
     gl.disable(gl.BLEND);
