@@ -119,6 +119,23 @@ def test_slope_and_intercept_are_applied_in_double_precision():
     assert np.array_equal(volume.values, 0.1 * values("float64") - 3) and volume.stored.dtype == np.uint8
 
 
+@pytest.mark.parametrize(
+    ("most", "used", "stat"),
+    [
+        ("max", "current", "anon 300\nfile 500\ninactive_file 200\nactive_file 250\nshmem 50\n"),
+        ("limit_in_bytes", "usage_in_bytes", "inactive_file 1\ntotal_inactive_file 200\ntotal_active_file 250\n"),
+    ],
+)
+def test_pages_of_files_in_a_control_group_are_free(tmp_path, most, used, stat):
+    """A field that is paged fills a group, and gives way."""
+    (tmp_path / "memory.stat").write_text(stat)
+    (tmp_path / f"memory.{used}").write_text("900\n")
+    (tmp_path / f"memory.{most}").write_text("1000\n")
+    assert limits._left_in(tmp_path, most, used) == [1000 - 900 + 450]
+    (tmp_path / f"memory.{most}").write_text("max\n")
+    assert limits._left_in(tmp_path, most, used) == []
+
+
 def test_limits_of_control_groups_count(tmp_path, monkeypatch):
     monkeypatch.setattr(limits, "_left_in_groups", lambda: [12345])
     assert limits.free_memory() == 12345

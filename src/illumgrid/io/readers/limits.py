@@ -1,5 +1,6 @@
 """What a header may promise: no more than its file can hold, nor than fits into the memory that is free."""
 
+import contextlib
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -89,12 +90,19 @@ def _left_in_groups() -> list[int]:
         most, used = ("max", "current") if controllers == "" else ("limit_in_bytes", "usage_in_bytes")
         inner = root / place.lstrip("/")
         for group in (inner, *inner.parents):
-            try:
-                limit = (group / f"memory.{most}").read_text("ascii").strip()
-                if limit != "max":
-                    left.append(int(limit) - int((group / f"memory.{used}").read_text("ascii")))
-            except (OSError, ValueError):
-                pass
+            with contextlib.suppress(OSError, ValueError):
+                left += _left_in(group, most, used)
             if group == root:
                 break
     return left
+
+
+def _left_in(group: Path, most: str, used: str) -> list[int]:
+    """What a control group has left, where it has a limit: pages of files, as of a field that is paged, give way."""
+    limit = (group / f"memory.{most}").read_text("ascii").strip()
+    if limit == "max":
+        return []
+    lines = (line.split() for line in (group / "memory.stat").read_text("ascii").splitlines())
+    held = {name: int(count) for name, count in lines}
+    cached = sum(held.get(f"total_{kind}", held.get(kind, 0)) for kind in ("inactive_file", "active_file"))
+    return [int(limit) - int((group / f"memory.{used}").read_text("ascii")) + cached]
