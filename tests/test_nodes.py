@@ -9,8 +9,8 @@ import pytest
 
 import illumgrid as ig
 from illumgrid import registry
-from illumgrid.field.volume import Volume, interpolate, outward_normals, world_to_index
-from illumgrid.grid import GREY, Nodes, fill_holes
+from illumgrid.field.volume import Volume, interpolate, outward_normals, slabs, world_to_index
+from illumgrid.grid import GREY, Nodes, fill_holes, nodes
 from illumgrid.stages import IlluminationGrid
 from illumgrid.testing import InterpolatorTests
 from illumgrid.transport.stages import fill_nodes
@@ -29,6 +29,16 @@ def test_nodes_know_their_place_their_level_and_their_normal(inside):
     assert np.array_equal(block.point, spec.nodes())
     assert np.array_equal(block.level, interpolate(volume, index))
     assert np.array_equal(block.normal, outward_normals(volume, index, inside) @ MIRRORED.T)
+
+
+def test_thick_layers_of_a_coarse_grid_are_looked_at_in_parts(monkeypatch):
+    field, seen, crossed = sky(ball(30), (0.5, 0.55)).fields[0], [], nodes._crossed_cells
+    whole = [nodes.reached(field, ig.GridSpec.over(field.volume, n)) for n in (2, 3, 30)]
+    monkeypatch.setattr(nodes, "slabs", lambda shape: slabs(shape, 5 * 30 * 30))
+    monkeypatch.setattr(nodes, "_crossed_cells", lambda f, rows: (seen.append(rows), crossed(f, rows))[1])
+    parts = [nodes.reached(field, ig.GridSpec.over(field.volume, n)) for n in (2, 3, 30)]
+    assert all(np.array_equal(a, b) for a, b in zip(whole, parts)) and any(not a.all() for a in whole)
+    assert max(rows.stop - rows.start for rows in seen) == 5
 
 
 def test_blocks_are_all_nodes_or_those_asked_for_some_at_a_time():

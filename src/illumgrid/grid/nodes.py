@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from illumgrid.field.lattice import GridSpec
 from illumgrid.field.scene import Field
-from illumgrid.field.volume import Floats, interpolate, outward_normals, world_to_index
+from illumgrid.field.volume import Floats, interpolate, outward_normals, slabs, world_to_index
 from illumgrid.grid.channels import Channels
 from illumgrid.grid.illumination import IlluminationGrid
 from illumgrid.grid.lookup import fill_holes
@@ -58,8 +58,10 @@ def reached(field: Field, spec: GridSpec) -> NDArray[np.bool_]:
     """
     along = [_overlapped(n - 1, m - 1) for n, m in zip(field.volume.shape, spec.shape)]
     crossed = np.zeros([len(parts) for parts in along], bool)
-    for row, cells in enumerate(along[0]):  # a layer of grid cells at a time: bounds the memory
-        layer = np.asarray(_crossed_cells(field, cells).any(axis=0))
+    for row, cells in enumerate(along[0]):
+        layer = np.zeros([n - 1 for n in field.volume.shape[1:]], bool)
+        for part in slabs((cells.stop - cells.start, *field.volume.shape[1:])):  # layers of a coarse grid are thick
+            layer |= _crossed_cells(field, slice(cells.start + part.start, cells.start + part.stop)).any(axis=0)
         crossed[row] = _any_overlapped(_any_overlapped(layer, along[1], 0), along[2], 1)
     nodes = np.zeros(spec.shape, bool)
     for corner in np.ndindex(2, 2, 2):

@@ -23,9 +23,11 @@ TO_DESCRIBE = 21
 """Bytes a voxel for the histogram, plateaus and warnings of a volume that is read; of a large one, see `of_field`."""
 TO_LIGHT = 44
 """Bytes a voxel for diagnosis, preparation and writing of a field; of a large one, see `of_field`."""
-_PARTS, _BRICKS, _WIDE_BRICKS = 1 << 24, 3.0, 0.5
-"""Voxels of a field of which all are looked at together; bytes for each further one, those of its bricks and a little:
-of bricks as wide again where the field is `LARGE`. The field itself is there, or paged."""
+_WHOLE, _IN_PARTS = 1 << 24, 3e8
+"""Voxels of a field of which all are looked at together; bytes for the parts of a larger one (0.25 GB of 512³ and of
+1024³). The field itself is there, or paged."""
+_BRICKS, _WIDE_BRICKS = 3.0, 0.3
+"""Bytes a voxel for bricks and a little; for those of a `LARGE` field, which are as wide again (0.25 in themselves)."""
 TO_DEPOSIT = 18
 """Bytes a voxel for the density of points."""
 TO_EXTRACT = 16
@@ -52,7 +54,9 @@ def check(what: str, need: float, todo: str) -> None:
 
 def of_field(voxels: int, each: int) -> float:
     """Bytes for a field that takes `each` a voxel: a large one is looked at in parts."""
-    return each * min(voxels, _PARTS) + (_WIDE_BRICKS if voxels >= LARGE else _BRICKS) * max(0, voxels - _PARTS)
+    if voxels <= _WHOLE:
+        return each * voxels
+    return _IN_PARTS + (_WIDE_BRICKS if voxels >= LARGE else _BRICKS) * voxels
 
 
 def check_run(
