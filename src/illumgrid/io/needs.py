@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from illumgrid.errors import BadInput
-from illumgrid.field.bricks import LARGE
 from illumgrid.field.lattice import GridSpec
 from illumgrid.grid import channels_of
 from illumgrid.grid.nested import finer, halvings
@@ -25,9 +24,7 @@ TO_LIGHT = 44
 """Bytes a voxel for diagnosis, preparation and writing of a field; of a large one, see `of_field`."""
 _WHOLE, _IN_PARTS = 1 << 24, 3e8
 """Voxels of a field of which all are looked at together; bytes for the parts of a larger one (0.25 GB of 512³ and of
-1024³). The field itself is there, or paged."""
-_BRICKS, _WIDE_BRICKS = 3.0, 0.3
-"""Bytes a voxel for bricks and a little; for those of a `LARGE` field, which are as wide again (0.25 in themselves)."""
+1024³). The field itself is there, or paged, and so are its bricks when a run asks."""
 TO_DEPOSIT = 18
 """Bytes a voxel for the density of points."""
 TO_EXTRACT = 16
@@ -54,9 +51,7 @@ def check(what: str, need: float, todo: str) -> None:
 
 def of_field(voxels: int, each: int) -> float:
     """Bytes for a field that takes `each` a voxel: a large one is looked at in parts."""
-    if voxels <= _WHOLE:
-        return each * voxels
-    return _IN_PARTS + (_WIDE_BRICKS if voxels >= LARGE else _BRICKS) * voxels
+    return each * voxels if voxels <= _WHOLE else _IN_PARTS
 
 
 def check_run(
