@@ -155,15 +155,14 @@ class Illumination:
         count = sum(len(lit) for grid in self.grids for lit in grid.lit_parts())
         if not count:
             return 1.0
-        highlights = tone.DIRECTED if any(isinstance(one, Distant) for one in self.scene.lights) else tone.EVEN
+        lamps = any(quad.material.emission.any() for quad in self.scene.quads)
+        directed = not lamps and any(isinstance(one, Distant) for one in self.scene.lights)
         # One after the other and in place: both together, with copies, would be as much as the light itself.
         mean = self._of_lit(lambda lit, albedo: lit.mean(axis=1), np.empty(count, np.float32))
         median = float(np.median(mean, overwrite_input=True))
         del mean
-        brightest = self._of_lit(lambda lit, albedo: (lit * albedo).max(axis=1), np.empty(count))
-        return tone.exposure_under(
-            median, float(np.quantile(brightest, highlights[0], overwrite_input=True)), highlights
-        )
+        brightest = self._of_lit(lambda lit, albedo: (lit * albedo).max(axis=1), np.empty(count, np.float32))
+        return tone.exposure_under(median, brightest, directed)
 
     def _of_lit(self, worth: Callable[[Any, Any], Any], out: NDArray[Any]) -> NDArray[Any]:
         """A number for each node that has light of its own, from the light (n, 3) of some and their albedo."""

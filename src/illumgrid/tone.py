@@ -7,33 +7,39 @@ WHITE = 0.8
 """Display radiance up to which the tone curve changes nothing; sRGB 231 of 255."""
 
 
-EVEN = (0.9, WHITE)
-"""Share of the light, and display radiance that it may not exceed: highlights begin to lose contrast there."""
+DIRECTED = 0.66
+"""Radiance of highlights under light from one side: sRGB 212 leaves the forms on the lit side their shades. In default
+previews of 13 volumes the 95th percentile of the object's pixels then lies at 195 to 213."""
+BRIGHT = 0.1
+"""Share of the nodes, or under light from one side of the light, above highlights."""
 
-DIRECTED = (0.95, 0.63)
-"""The same under a light from one side: sRGB 206 leaves the forms on the lit side their shades. In default previews of
-13 volumes the 95th percentile of the object's pixels then lies at 205 to 220."""
 
-
-def automatic_exposure(
-    irradiance: NDArray[np.floating], albedo: NDArray[np.floating], highlights: tuple[float, float] = EVEN
-) -> float:
+def automatic_exposure(irradiance: NDArray[np.floating], albedo: NDArray[np.floating], directed: bool = False) -> float:
     """Factor on albedo/π · irradiance, (n, 3) each, under which a picture is neither dark nor burnt out.
 
-    Under the median light a colour given as albedo comes out as that colour, unless that share of the brightest channel
-    would then exceed the radiance of `highlights`. 1 if all is dark.
+    Under the median light a colour given as albedo comes out as that colour, unless the highlights would then exceed
+    the radiance `WHITE`, or `DIRECTED`: see `exposure_under`. 1 if all is dark.
     """
     if not len(irradiance):
         return 1.0
-    median = np.median(irradiance.mean(axis=1))
-    return exposure_under(median, np.quantile((irradiance * albedo).max(axis=1), highlights[0]), highlights)
+    return exposure_under(np.median(irradiance.mean(axis=1)), (irradiance * albedo).max(axis=1), directed)
 
 
-def exposure_under(median: float, bright: float, highlights: tuple[float, float] = EVEN) -> float:
-    """As `automatic_exposure`, from the median irradiance and the share of the brightest channels of albedo · it."""
-    median, bright, most = float(median) / np.pi, float(bright) / np.pi, highlights[1]
-    factors = [target / value for target, value in ((1.0, median), (most, bright)) if 0 < value < np.inf]
-    return min(factors, default=1.0)
+def exposure_under(median: float, brightest: NDArray[np.floating], directed: bool = False) -> float:
+    """As `automatic_exposure`, from the median irradiance and the brightest channels (n,) of albedo · it, sorted here.
+
+    Highlights are above the light that a tenth of the nodes exceed. Under light from one side, whose brightness has a
+    bound, they are the brightest tenth of all light: nodes hidden in folds and noise, which nobody sees, are dark and
+    many, but hold little of it.
+    """
+    brightest.sort()
+    if directed:
+        total = np.cumsum(brightest, dtype=float)
+        bright = brightest[np.searchsorted(total, (1.0 - BRIGHT) * total[-1])]
+    else:
+        bright = np.quantile(brightest, 1.0 - BRIGHT)
+    targets = (1.0, float(median) / np.pi), (DIRECTED if directed else WHITE, float(bright) / np.pi)
+    return min((target / value for target, value in targets if 0 < value < np.inf), default=1.0)
 
 
 def curve(linear: NDArray[np.floating]) -> NDArray[np.floating]:
