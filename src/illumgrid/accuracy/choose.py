@@ -174,7 +174,7 @@ class Search:
         if size in self.ahead or before is None or before.pace is None or len(self.took) < 2:  # the first loads kernels
             return False
         times = (size / before.grid) ** 3
-        takes = times * self.took[before.grid]
+        takes = times**0.75 * self.took[before.grid]  # part of it is the same for any size
         if self.goal.error is None:
             return time.perf_counter() + takes + times * before.pace.seconds(before.nodes, FEWEST_PATHS) > self.until
         best = choose(found, self.pace, self.goal)
@@ -185,9 +185,9 @@ class Search:
         points, most = 384, 1024
         if self.goal.error is None:
             each = 2 * 8 * TRIAL_PATHS * self.pace.path
-            each += self.looking * LOOKED_COST * self.pace.path
             if each * len(sizes) * 96 > 0.1 * self.goal.seconds:
                 sizes = sizes[len(sizes) % 2 :: 2]
+            each += self.looking * LOOKED_COST * self.pace.path
             points = int(np.clip(0.1 * self.goal.seconds / (each * len(sizes)), 64, 384))
             most = int(np.clip(0.05 * self.goal.seconds / (REFERENCE_COST * self.pace.path * points), 64, most))
         return self.look(sizes, points, self.goal.error or 0.02, seed, most)
