@@ -174,7 +174,7 @@ class Search:
         if size in self.ahead or before is None or before.pace is None or len(self.took) < 2:  # the first loads kernels
             return False
         times = (size / before.grid) ** 3
-        takes = times**0.75 * self.took[before.grid]  # part of it is the same for any size
+        takes: float = times**0.75 * self.took[before.grid]  # part of it is the same for any size
         if self.goal.error is None:
             return time.perf_counter() + takes + times * before.pace.seconds(before.nodes, FEWEST_PATHS) > self.until
         best = choose(found, self.pace, self.goal)
