@@ -185,7 +185,7 @@ class Search:
         points, most = 384, 1024
         if self.goal.error is None:
             each = 2 * 8 * TRIAL_PATHS * self.pace.path
-            if each * len(sizes) * 96 > 0.1 * self.goal.seconds:
+            if len(sizes) > 1 and each * len(sizes) * 96 > 0.1 * self.goal.seconds:
                 sizes = sizes[len(sizes) % 2 :: 2]
             each += self.looking * LOOKED_COST * self.pace.path
             points = int(np.clip(0.1 * self.goal.seconds / (each * len(sizes)), 64, 384))
