@@ -17,7 +17,9 @@ from illumgrid.field.plateaus import plateaus
 from illumgrid.field.scene import Field
 from illumgrid.field.volume import Volume, histogram, interpolate, slabs, world_to_index
 from illumgrid.grid.nodes import reachable
-from illumgrid.interpolators import nearest
+from illumgrid.interpolators import bilateral, nearest
+from illumgrid.interpolators.bilateral import Bilateral
+from illumgrid.interpolators.nearest import Nearest
 from illumgrid.samplers import coarea, direct
 from illumgrid.samplers.coarea import points_on_level_sets
 from illumgrid.show.camera import outline_of
@@ -110,20 +112,23 @@ def test_pieces_of_plateaus_are_forgotten_when_they_end(monkeypatch):
     assert peaks[1] < 1.3 * peaks[0]
 
 
-def test_a_further_lit_node_takes_60_bytes(monkeypatch):
+# By level and normal: moments and number 32, its number as it is filled 8, in bins 52, their order 12, what is read 20.
+@pytest.mark.parametrize(("interpolator", "most"), [(Nearest(), 60), (Bilateral(1.0), 124)])
+def test_a_further_lit_node_takes_60_bytes_or_what_bins_take(monkeypatch, interpolator, most):
     for module, name, value in ((walk, "MOST", 2000), (walk, "LOOKED_AT", 4000), (nearest, "_SLAB", 2000)):
         monkeypatch.setattr(module, name, value)
+    monkeypatch.setattr(bilateral, "_BLOCK", 1000)
     monkeypatch.setattr(direct, "_BATCH", 1000)
     scene = ig.Scene.sky(ball(20), range=(-1.0, 1.3), albedo=(0.8, 0.5, 0.3))  # every node is lit, in three channels
     peaks, nodes = [], []
     for grid in (8, 30, 50):  # the first compiles
         tracemalloc.start()
-        light = ig.run(scene, grid=grid, paths=1, bounces=0, judge=False)
+        light = ig.run(scene, grid=grid, paths=1, bounces=0, judge=False, interpolator=interpolator)
         peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
         nodes.append(light.recipe["queries"])
     assert nodes[1:] == [30**3, 50**3] and len(light.grids[0].channels) == 3
-    assert (peaks[2] - peaks[1]) / (nodes[2] - nodes[1]) <= 60
+    assert (peaks[2] - peaks[1]) / (nodes[2] - nodes[1]) <= most
 
 
 def test_cells_among_which_points_are_chosen_are_held_once(monkeypatch):

@@ -114,23 +114,25 @@ class Nodes:
         return IlluminationGrid(self.spec, filled, bars.reshape(shape), counts, channels, each)
 
     def grid_of(
-        self,
-        flat: NDArray[np.integer],
-        light: NDArray[np.float32],
-        error: NDArray[np.float32],
-        support: NDArray[np.float32],
-        channels: Channels,
-        errors: NDArray[np.float32] | None = None,
+        self, flat: NDArray[np.integer], found: list[NDArray[np.float32] | None], channels: Channels
     ) -> IlluminationGrid:
-        """Grid of light (m, C), error (m,) and support (m,) at the nodes (m,) with these numbers, the others holes."""
-        every = np.zeros((len(self), light.shape[1]), np.float32)
-        bars, counts = np.full(len(self), np.inf, np.float32), np.zeros(len(self), np.float32)
-        every[flat], bars[flat], counts[flat] = light, error, support
-        each = None
-        if errors is not None:
-            each = np.full(every.shape, np.inf, np.float32)
-            each[flat] = errors
-        return self.grid(every, bars, counts, channels, each)
+        """Grid of light (m, C), error (m,), support (m,) and `errors` at the nodes (m,) with these numbers.
+
+        The others are holes. The arrays are taken out of the list as they are spread, so that none is held twice.
+        """
+
+        def whole(which: int, empty: float) -> NDArray[np.float32] | None:
+            part, found[which] = found[which], None
+            if part is None:
+                return None
+            every = np.full((len(self), *part.shape[1:]), empty, np.float32)
+            every[flat] = part
+            return every.reshape(*self.spec.shape, *part.shape[1:])
+
+        light, support = whole(0, 0.0), whole(2, 0.0)
+        assert light is not None and support is not None
+        light = fill_holes(self.spec.spacing, light, support)  # takes more than the errors, which come after it
+        return IlluminationGrid(self.spec, light, whole(1, np.inf), support, channels, whole(3, np.inf))
 
 
 @dataclass(frozen=True, eq=False)

@@ -33,36 +33,50 @@ class Bins(NamedTuple):
 
 
 def bins(samples: Samples, nodes: Nodes) -> Bins:
-    """Sort samples into the nodes' lattice; holes are left out, and marked."""
+    """Sort samples into the nodes' lattice, some at a time; holes are left out, and marked."""
     from illumgrid.grid.reading import slopes
 
     spec, volume = nodes.spec, nodes.field.volume
-    queries = samples.queries[:]  # computed once, where only numbers of nodes are kept
     rows, nz = spec.shape[0] * spec.shape[1], spec.shape[2]
-    index = world_to_index(spec, queries.point)
-    closest = np.clip(np.round(index), 0, np.array(spec.shape) - 1).astype(np.int64)
-    flat = np.ravel_multi_index(tuple(closest.T), spec.shape)
-    lit = samples.paths > 0
-    dark = np.unique(flat[~lit & (np.abs(index - closest) < _ON_A_NODE).all(axis=1)])
-    good = np.flatnonzero(lit)
-    good = good[np.lexsort((queries.id[good], flat[good]))]
-    slope = np.zeros(len(good))
-    slopes(volume.stored, volume.spacing, spec.spacing, world_to_index(volume, queries.point[good]), slope)
     scale, shift = _level_units(nodes)
-    place = np.column_stack(
-        [
-            index[good], (volume.to_stored(queries.level[good, nodes.number]) - shift) * scale,
-            queries.normal[good] @ volume.direction, slope * scale,
-        ]
-    )  # fmt: skip
-    start = np.zeros(rows + 1, np.int64)
-    np.cumsum(np.bincount(flat[good] // nz, minlength=rows), out=start[1:])
-    column = (flat[good] % nz).astype(np.int32)
-    variance = np.square(samples.error[good], dtype=np.float64)
+    count, channels = len(samples), samples.light.shape[1] if samples.channels.mixable else 0
+    flat, dark = np.empty(count, np.int32 if len(nodes) < 1 << 31 else np.int64), [np.zeros(0, np.int64)]
+    place, variance = np.empty((count, 8), np.float32), np.empty(count, np.float32)
+    each = np.empty((count, channels), np.float32)
+    for first in range(0, count, _BLOCK):
+        part = samples[first : first + _BLOCK]  # its queries are computed here, where only numbers of nodes are kept
+        queries, index = part.queries, world_to_index(spec, part.queries.point)
+        closest = np.clip(np.round(index), 0, np.array(spec.shape) - 1).astype(np.int64)
+        nearest = np.ravel_multi_index(tuple(closest.T), spec.shape)
+        lit = part.paths > 0
+        dark.append(nearest[~lit & (np.abs(index - closest) < _ON_A_NODE).all(axis=1)])
+        good = np.flatnonzero(lit)
+        slope, here = np.zeros(len(good)), first + good
+        slopes(volume.stored, volume.spacing, spec.spacing, world_to_index(volume, queries.point[good]), slope)
+        place[here] = np.column_stack(
+            [
+                index[good], (volume.to_stored(queries.level[good, nodes.number]) - shift) * scale,
+                queries.normal[good] @ volume.direction, slope * scale,
+            ]
+        )  # fmt: skip
+        flat[first : first + _BLOCK] = nearest
+        variance[here] = np.square(part.error[good], dtype=np.float64)
+        if (errors := part.errors) is not None:
+            each[here] = np.square(errors[good])
+    good = np.flatnonzero(samples.paths > 0)
+    good = good[np.lexsort((samples.queries.id[good], flat[good]))]
+    start, near = np.zeros(rows + 1, np.int64), flat[good]
+    np.cumsum(np.bincount(near // nz, minlength=rows), out=start[1:])
     light = np.ascontiguousarray(samples.light[good], np.float32)
-    own = samples.errors
-    each = np.zeros((len(good), 0), np.float32) if own is None else np.square(own[good])
-    return Bins(start, column, place.astype(np.float32), light, variance.astype(np.float32), each, dark)
+    place, variance, each = (_in_order(array, good) for array in (place, variance, each))
+    return Bins(start, (near % nz).astype(np.int32), place, light, variance, each, np.unique(np.concatenate(dark)))
+
+
+def _in_order(array: NDArray[np.float32], rows: NDArray[np.integer]) -> NDArray[np.float32]:
+    """Rows of an array in this order, sorted where they are, one column at a time."""
+    for column in np.atleast_2d(array.T):
+        column[: len(rows)] = column[rows]
+    return array[: len(rows)]
 
 
 def _level_units(nodes: Nodes) -> tuple[float, float]:
@@ -102,8 +116,7 @@ class Bilateral:
         """Fill a grid of `density` times the nodes: see `illumgrid.stages.Interpolator`."""
         dense = Nodes(denser(nodes.spec, self.density), nodes.field, nodes.number)
         flat = reachable(nodes.field, dense.spec)
-        light, error, support, errors = read(samples, nodes, dense, flat)
-        return dense.grid_of(flat, light, error, support, samples.channels, errors)
+        return dense.grid_of(flat, list(read(samples, nodes, dense, flat)), samples.channels)
 
 
 def read(

@@ -103,7 +103,7 @@ def _coarsest(samples: Samples, place: NDArray[np.int64], nodes: Nodes, own: Nod
         far, sample = tree.query(own.spec.nodes(flat[dark]) - own.spec.origin, distance_upper_bound=diagonal(own.spec))
         dark, sample = dark[np.isfinite(far)], lit[sample[np.isfinite(far)]]
         light[dark], error[dark], support[dark] = samples.light[sample], samples.error[sample], 1.0
-    whole = own.grid_of(flat, light, error, support, samples.channels)
+    whole = own.grid_of(flat, [light, error, support, None], samples.channels)
     asked = np.zeros(own.spec.shape, bool)
     asked.reshape(-1)[flat] = True
     layout = in_cells(nodes.spec.shape, all_corners(asked), step)

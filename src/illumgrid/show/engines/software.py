@@ -19,7 +19,7 @@ from illumgrid.tone import encode_rgba
 
 SIDE = 2  # sub-samples along each side of a pixel
 COAT_RAYS = 4  # from each sub-sample that shows a coat, in pictures by lookups
-_ROWS = 24  # picture rows that are traced together: bounds the memory
+_ROWS = 8  # picture rows that are traced together: bounds the memory
 
 
 def directions_of(camera: Camera, width: int, rows: range, height: int) -> Floats:
