@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from illumgrid.cli.heap import return_holes
 from illumgrid.cli.long import check_spread, kept, shared_out, spread
 from illumgrid.cli.outcome import again, finished, report
 from illumgrid.cli.reading import NONE, given, with_reading
@@ -222,6 +223,7 @@ def run(
                     say(f"  smoothed that far: {again(finding.options)}")
         if backend == "auto":
             say(_why_auto())
+        return_holes()
         with closing(keep), spread(workers, dask, any_machine) as over, progress_bars(keep.standing) as progress:
             light = light_up(
                 scene, **shared_out(stages, workers), **numbers, error=error, seconds=seconds, texels=texels,
