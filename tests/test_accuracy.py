@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from illumgrid import run
+from illumgrid.accuracy.around import lattice
 from illumgrid.accuracy.choose import Goal, Plan, choose, outlook, planned, sizes
 from illumgrid.accuracy.cost import Pace
 from illumgrid.accuracy.judge import judge
@@ -140,7 +141,8 @@ def test_the_split_finds_parts_that_were_put_in():
 def test_the_measured_noise_is_that_of_two_built_grids():
     scene, nodes = FIELDS["few bumps"](), 24
     probe = Probe.start(scene, prepare(BACKEND, scene), 1500, 0.05, 0)
-    found = probe.measure(specs_over(scene, nodes), probe.fewer(3), 16)
+    ahead = lattice(specs_over(scene, nodes), probe.reference.tracer, 3)
+    found = probe.measure(ahead, probe.reference.cut_off(3), 16)
     one, other = (
         look_up(run(scene, grid=nodes, paths=16, bounces=3, seed=s).grids, probe.reference.queries)[0] for s in (8, 9)
     )
@@ -199,14 +201,14 @@ class Clock:
 
 @pytest.mark.parametrize("factor", [0.2, 0.5, 1.0, 2.0, 3.0])
 def test_a_time_is_kept_whatever_the_pace(factor):
-    plan = Plan(grid=8, paths=400, bounces=4, error=0.01, seconds=8.0, fill=0.5, pilot=1.0, met=True, why=())
+    plan = Plan(grid=8, paths=400, bounces=4, error=0.01, seconds=8.0, fill=0.5, met=True, why=())
     clock = Clock(lambda now: factor * 8.0 / 400)
     done = clock.walk(plan, 10.0)
     assert 0.85 * 9.0 <= clock.now <= 9.05 and done == pytest.approx(9.0 / clock.pace(0), rel=0.1)  # 9: the rest fills
 
 
 def test_a_machine_that_slows_down_is_late_by_what_it_slowed_last():
-    plan = Plan(grid=8, paths=400, bounces=4, error=0.01, seconds=8.0, fill=0.0, pilot=1.0, met=True, why=())
+    plan = Plan(grid=8, paths=400, bounces=4, error=0.01, seconds=8.0, fill=0.0, met=True, why=())
     clock = Clock(lambda now: 0.02 if now < 5 else 0.03)
     clock.walk(plan, 10.0)
     assert 8.5 <= clock.now <= 12.5
@@ -218,8 +220,8 @@ def test_the_probe_of_an_error_climbs_to_finer_grids_where_its_first_choice_will
     """The first look sees few points, and may find a grid good enough by chance."""
     scene, looks = FIELDS["few bumps"](), []
 
-    def lucky(probe, specs, fewer, paths):
-        grid = max(specs[0].shape)
+    def lucky(probe, ahead, fewer, paths):
+        grid = max(ahead.specs[0].shape)
         looks.append((len(probe.reference), grid))
         first = looks[0][0] == len(probe.reference)
         return measured(grid, 0.001 if first or grid >= 20 else 0.1, nodes=grid**3)
@@ -240,17 +242,18 @@ def test_what_cannot_be_had_is_said():
 def test_a_plan_that_is_crude_late_or_out_of_reach_is_announced():
     tried = [measured(20, 0.02), measured(40, 0.005)]
 
-    def said(goal, tried=tried):
-        return outlook(tried, PACE, goal, choose(tried, PACE, goal))
+    def said(goal, pilot=0.0):
+        return outlook(tried, PACE, goal, choose(tried, PACE, goal), pilot)
 
     easy = choose(tried, PACE, Goal(0.05)).seconds
     assert said(Goal(0.05)) == "" and said(Goal(seconds=10 * easy)) == ""
     short = said(Goal(seconds=1e-3))
-    assert "0.001 seconds are too short" in short and "10% takes about" in short
+    assert "0.001 seconds are too short" in short and "10% takes about 0.11 seconds" in short
+    assert "10% takes about 2.1 seconds" in said(Goal(seconds=1e-3), pilot=2.0)  # which --seconds counts, too
     assert "out of reach" in said(Goal(1e-4))
     times = 100 / choose(tried, PACE, Goal(0.021)).seconds
     slow = Pace(times * PACE.node, times * PACE.path)
-    late = outlook(tried, slow, Goal(0.021), choose(tried, slow, Goal(0.021)))
+    late = outlook(tried, slow, Goal(0.021), choose(tried, slow, Goal(0.021)), 0.0)
     assert "2.1% is predicted to take" in late and "--seconds 60 reaches" in late
 
 
@@ -282,8 +285,10 @@ def test_run_reports_what_it_chose_and_what_it_reached():
     assert recipe["plan"]["met"] and recipe["plan"]["grid"] in (recipe["grid"], (recipe["refined"] or {}).get("from"))
     assert recipe["paths"] == recipe["plan"]["paths"] and len(recipe["plan"]["why"]) >= 2
     assert recipe["reached"] <= 1.3 * 0.05
-    kept = run(scene, seconds=1.0, grid=12, bounces=3, seed=0).recipe
-    assert kept["grid"] == 12 and kept["bounces"] == 3
+    kept = run(
+        scene, seconds=1e6, grid=12, paths=8, bounces=3, seed=0
+    ).recipe  # paths that are given end, not the clock
+    assert kept["grid"] == 12 and kept["bounces"] == 3 and kept["paths"] == kept["plan"]["paths"] == 8
     assert run(scene, grid=8, paths=2, bounces=1).recipe["plan"] is None
 
 

@@ -30,8 +30,9 @@ from illumgrid.cli import report
 from illumgrid.cli.report import table
 from illumgrid.field.lattice import specs_over
 from illumgrid.field.scene import Field, Scene
-from illumgrid.field.volume import world_to_index
+from illumgrid.field.volume import Volume, world_to_index
 from illumgrid.grid.nodes import reachable
+from illumgrid.interpolators.bilateral import Bilateral
 from illumgrid.interpolators.nearest import Nearest
 from illumgrid.interpolators.rbf import Rbf
 from illumgrid.interpolators.splat import Splat
@@ -354,20 +355,45 @@ def test_runs_default_under_a_sky_races_with_its_first_look_and_its_command_line
     assert "nearest was" not in str(report.advice([record | {"rmse": 0.001}], PARTS, 3))
     assert "dominated" not in str(report.advice([record | {"rmse": 0.2}], PARTS, 3))
     predicted, without = race(), race()
-    predicted.predict_looked(replace(default.method))
+    predicted.predict(default.method, default.interpolator, None, None, None, default=True)
     (seen,) = predicted.points
     assert seen.default and not seen.built and seen.queries == default.queries
     np.testing.assert_allclose(seen.light[0], default.light[0], rtol=1e-4)
     assert "does not compete" in _show_default(without, None, None, 1e-9)[0] and not without.points
 
 
+def test_runs_default_for_noisy_data_in_the_studio_is_read_by_level_and_normal():
+    smooth = ball(14)
+    noise = np.random.default_rng(0).normal(0, 0.25, smooth.shape)
+    rough = Volume((smooth.values + noise).astype(np.float32), smooth.origin, smooth.spacing)
+    scene = Scene.studio(rough, range=(0.3, 0.7))
+    tracer = prepare(BACKEND, scene)
+    exact = begin(tracer, unseen_on_level_sets(scene, 8, 200, 0), 3, 0)
+    way = Method(Direct(), BACKEND, tracer, "levelset", (Nearest(), Bilateral()))
+    own = run(scene, bounces=3, isovalues=2, seed=5, judge=False)
+    expected = look_up(own.grids, exact.queries)[0]
+    for budget in (1e6, 1e-9):
+        race = Race(scene, {"levelset": exact}, [way], [6], 3, 5)
+        _show_default(race, None, None, budget)
+        (default,) = race.points
+        assert own.recipe["by_normal"] and default.default and default.built == (budget > 1)
+        assert (default.paths, default.queries) == (own.recipe["paths"], own.recipe["queries"]) and default.time > 0
+        np.testing.assert_allclose(default.light[0], expected, rtol=1e-4)
+        record = report.record(default, race.references, True)
+        assert record["contestant"] == "direct, numba (levelset), bilateral 1.0"  # beside that of density 2
+        assert report.options(record, 3) == (
+            "--sampler direct --backend numba --interpolator bilateral --set interpolator.density=1.0 "
+            f"--grid {own.recipe['grid']} --paths 16 --bounces 3"
+        )
+
+
 def test_points_are_given_up_for_a_sharper_truth_where_light_is_rough(truth):
     _, exact = truth
-    assert len(_thinned(exact, "levelset", 1.0, 1e9, 0)) == len(exact)
+    assert len(_thinned(exact, 1.0, 1e9, 0)) == len(exact)
     many = exact[np.arange(2000) % len(exact)]
-    few = _thinned(many, "mesh", 1.0, 0.6 * (exact.error / 0.01) ** 2, 0)
-    assert few.surface == "mesh" and abs(len(few) - 1200) <= 1
-    assert len(_thinned(many, "mesh", 1.0, 1e-9, 0)) == 500
+    few = _thinned(many, 1.0, 0.6 * (exact.error / 0.01) ** 2, 0)
+    assert abs(len(few) - 1200) <= 1
+    assert len(_thinned(many, 1.0, 1e-9, 0)) == 500
 
 
 def test_time_is_kept_for_all_that_another_seed_takes(truth):

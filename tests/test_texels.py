@@ -57,7 +57,7 @@ def test_a_run_for_an_error_refines_the_walls_unless_their_texels_are_given(room
 
     def planned(*_, texels, **how):
         given.append(texels)
-        return Plan(6, 2, 2, 0.1, 1.0, 0.0, 0.0, True, (), finer=1.0 if texels else 2.0), None
+        return Plan(6, 2, 2, 0.1, 1.0, 0.0, True, (), finer=1.0 if texels else 2.0), None
 
     monkeypatch.setattr(chain, "planned", planned)
     finer, asked = (ig.run(scene, error=0.1, isovalues=4, judge=False, texels=n) for n in (None, 7))

@@ -6,8 +6,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from illumgrid.accuracy.around import lattice, looked
 from illumgrid.accuracy.cost import Pace, measure_pace
-from illumgrid.accuracy.looked import looked
 from illumgrid.accuracy.probe import FEWEST_PATHS, MOST_PATHS, Measured, Probe
 from illumgrid.accuracy.reference import Reference
 from illumgrid.accuracy.texels import Walls, walls_for
@@ -65,7 +65,6 @@ class Plan:
     error: float  # predicted, relative
     seconds: float  # predicted, of the run
     fill: float  # seconds of those that go into queries and grids, not into paths
-    pilot: float  # seconds that the probe took
     met: bool  # whether the asked error, or time, is predicted to be kept
     why: tuple[str, ...]  # sentences for the user
     finer: float = 1.0  # texels of walls along each edge, for each of the scene's
@@ -124,7 +123,7 @@ class Search:
     looking: bool  # whether a first look may choose the nodes
     seed: int  # of the run
     until: float  # of the clock: then the run is to end
-    ahead: dict[int, tuple[Ahead, int]] = field(default_factory=dict)  # first looks so far, and bounces that follow
+    ahead: dict[int, Ahead] = field(default_factory=dict)  # first looks so far
     took: dict[int, float] = field(default_factory=dict)  # seconds of a look and of what was measured of it
 
     def look(
@@ -138,7 +137,7 @@ class Search:
         probe = Probe.start(self.scene, self.tracer, points, error, seed, most)
         bounces = self.goal.bounces if bounces is None else bounces
         followed = probe.bounces_for(SHARE * error) if bounces is None else bounces
-        fewer, found, goal = probe.fewer(followed), list[Measured](), replace(self.goal, texels=0)
+        fewer, found, goal = probe.reference.cut_off(followed), list[Measured](), replace(self.goal, texels=0)
         for looking in kinds[: 1 + self.looking]:
             for left, size in zip(range(len(sizes), 0, -1), sizes):
                 if looking and self._too_late(size, found):
@@ -158,13 +157,12 @@ class Search:
 
     def _measured(self, probe: Probe, size: int, looking: bool, fewer: Reference) -> Measured:
         if not looking:
-            return probe.measure(specs_over(self.scene, size), fewer, TRIAL_PATHS)
+            return probe.measure(lattice(specs_over(self.scene, size), self.tracer, fewer.bounces), fewer, TRIAL_PATHS)
         begun = time.perf_counter()
         if size not in self.ahead:
             self.ahead[size] = looked(self.scene, self.tracer, size, self.goal.bounces, self.seed)
-        ahead, followed = self.ahead[size]
         light = probe.reference if self.goal.bounces is None else fewer  # else paths have no end
-        found = probe.measure_looked(size, ahead, followed, light, LOOKED_PATHS)
+        found = probe.measure(self.ahead[size], light, LOOKED_PATHS)
         self.took[size] = time.perf_counter() - begun
         return found
 
@@ -173,7 +171,7 @@ class Search:
         before = found[-1] if found and found[-1].looked else None
         if size in self.ahead or before is None or before.pace is None or len(self.took) < 2:  # the first loads kernels
             return False
-        times = (size / before.grid) ** 3
+        times: float = (size / before.grid) ** 3
         takes: float = times**0.75 * self.took[before.grid]  # part of it is the same for any size
         if self.goal.error is None:
             return time.perf_counter() + takes + times * before.pace.seconds(before.nodes, FEWEST_PATHS) > self.until
@@ -255,24 +253,28 @@ def planned(
     if walls is not None:
         fine = wall_queries(finer_texels(scene, walls.finer), levels)
         goal = replace(goal, texels=sum(len(queries) for queries in fine))
-    choice = choose(look.tried, pace, replace(goal, seconds=left - (time.perf_counter() - begun)))
+    pilot = time.perf_counter() - begun
+    choice = choose(look.tried, pace, replace(goal, seconds=left - pilot))
     why = reasons(scene, choice, look.bounces, look.probe.left_out(look.bounces), walls)
-    said = outlook(look.tried, pace, replace(goal, seconds=np.inf if seconds is None else seconds), choice)
-    ahead, _ = search.ahead[choice.measured.grid] if choice.measured.looked else (None, None)
+    said = outlook(look.tried, pace, replace(goal, seconds=np.inf if seconds is None else seconds), choice, pilot)
+    ahead = search.ahead[choice.measured.grid] if choice.measured.looked else None
     return Plan(
         choice.measured.grid, choice.paths, None if ahead and bounces is None else look.bounces, choice.error,
-        choice.seconds, choice.measured.nodes * (choice.measured.pace or pace).node, time.perf_counter() - begun,
-        choice.met, why, 1.0 if walls is None else walls.finer, ahead is not None, said,
+        choice.seconds, choice.measured.nodes * (choice.measured.pace or pace).node, choice.met, why,
+        1.0 if walls is None else walls.finer, ahead is not None, said,
     ), ahead  # fmt: skip
 
 
-def outlook(tried: Sequence[Measured], pace: Pace, goal: Goal, choice: Choice) -> str:
-    """What a user should know before the light is computed; empty if the run is short and as good as asked."""
+def outlook(tried: Sequence[Measured], pace: Pace, goal: Goal, choice: Choice, pilot: float) -> str:
+    """What a user should know before the light is computed; empty if the run is short and as good as asked.
+
+    Times that another goal would take include the seconds of the pilot, as those of `goal` do.
+    """
     if goal.error is None:
         if choice.met and choice.error <= CRUDE:
             return ""
         better = choose(tried, pace, replace(goal, error=CRUDE, seconds=np.inf))
-        cost = f"; {CRUDE:.0%} takes about {_time(better.seconds)}" if better.met else ""
+        cost = f"; {CRUDE:.0%} takes about {_time(pilot + better.seconds)}" if better.met else ""
         return (
             f"{goal.seconds:g} seconds are too short for this scene: an error of about {choice.error:.0%} is predicted"
             f"{cost}; --error chooses the time"
@@ -289,7 +291,9 @@ def outlook(tried: Sequence[Measured], pace: Pace, goal: Goal, choice: Choice) -
 
 
 def _time(seconds: float) -> str:
-    return f"{seconds:.0f} seconds" if seconds < 90 else f"{seconds / 60:.0f} minutes"
+    if seconds >= 90:
+        return f"{seconds / 60:.0f} minutes"
+    return f"{seconds:.0f} seconds" if seconds >= 9.5 else f"{seconds:.2g} seconds"
 
 
 def reasons(scene: Scene, choice: Choice, bounces: int, left_out: float, walls: Walls | None = None) -> tuple[str, ...]:

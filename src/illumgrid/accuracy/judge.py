@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from illumgrid.accuracy.around import lattice
 from illumgrid.accuracy.points import unseen_in_volume, unseen_on_walls
 from illumgrid.accuracy.probe import Probe
 from illumgrid.accuracy.reference import Errors, Reference, begin, errors, look_up
@@ -75,6 +76,7 @@ def remedies(scene: Scene, backend: Backend, specs: Sequence[GridSpec], bounces:
             probe = Probe.start(of, prepare(backend, of), 512, 0.05, seed, most=128)
         except BadInput:  # no light where it looked
             return {}
-        part = probe.measure(nodes, probe.fewer(bounces), 32).parts
+        fewer = probe.reference.cut_off(bounces)
+        part = probe.measure(lattice(nodes, fewer.tracer, fewer.bounces), fewer, 32).parts
         found[what] = float(np.sqrt(max(0.0, part.total - part.noise)))
     return found

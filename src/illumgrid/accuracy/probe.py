@@ -6,13 +6,12 @@ points: that measures the error of a grid without building it.
 """
 
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from illumgrid.accuracy.around import around
 from illumgrid.accuracy.cost import Pace
-from illumgrid.accuracy.looked import Around
 from illumgrid.accuracy.points import unseen_in_volume
 from illumgrid.accuracy.reference import Parts, Reference, begin, converge, missing, parts_of
 from illumgrid.bake.accumulator import Bake
@@ -20,9 +19,7 @@ from illumgrid.bake.ahead import Ahead
 from illumgrid.bake.bounces import enough_bounces
 from illumgrid.errors import BadInput
 from illumgrid.field.scene import Scene
-from illumgrid.grid import GridSpec
 from illumgrid.rng import shifted_seed
-from illumgrid.samplers.direct import Corners, corners
 from illumgrid.transport.tracer import Tracer
 
 FEWEST_PATHS, MOST_PATHS = 4, 1 << 16  # from each node of a planned run
@@ -38,8 +35,12 @@ class Measured:
     parts: Parts
     paths: int
     falls: float = 1.0  # the noise (squared) falls as paths to this power; more than 1 for well-spread paths
-    looked: bool = False  # whether these nodes are those of a first look, which chose the nodes to light
-    pace: Pace | None = None  # of its own, if other than that of lattices
+    pace: Pace | None = None  # of its own, where a first look chose the nodes
+
+    @property
+    def looked(self) -> bool:
+        """Whether a first look chose the nodes, from a lattice of `grid`."""
+        return self.pace is not None
 
     @property
     def floor(self) -> float:
@@ -83,10 +84,6 @@ class Probe:
         few = first[:: max(1, len(first) // 512)]
         return cls(scene, seed, converge(first, error, most), few)
 
-    def fewer(self, bounces: int) -> Reference:
-        """The light at the points with fewer bounces, by the same paths."""
-        return self.reference.cut_off(bounces)
-
     def left_out(self, bounces: int) -> float:
         """Root mean square of the light that more bounces would add, relative."""
         return float(np.sqrt((missing(self.few.cut_off(bounces), self.few) ** 2).mean()))
@@ -96,35 +93,22 @@ class Probe:
         most = self.reference.bounces
         return next((b for b in BOUNCES if b < most and self.left_out(b) <= tolerance), most)
 
-    def measure(self, specs: Sequence[GridSpec], fewer: Reference, paths: int) -> Measured:
-        """The error of grids with these lattices and the bounces of `fewer`, by `paths` paths from two seeds each."""
-        around, tracer = corners(self.scene, specs, self.reference.queries), self.reference.tracer
-        some = self._walked(around, tracer, fewer.bounces, range(paths // 4))
-        first, last = (
-            self._parts(around, pair, fewer)
-            for pair in (some, [bake.walk(tracer, range(paths // 4, paths)) for bake in some])
-        )
+    def measure(self, ahead: Ahead, fewer: Reference, paths: int) -> Measured:
+        """The error of a run before it is built, by `paths` paths from two seeds each; `fewer` has its bounces."""
+        clock, parts = [time.perf_counter()], list[Parts]()
+        near = around(self.scene, ahead, self.reference.queries)
+        clock.append(time.perf_counter())
+        pair = [Bake.of([near.asked], ahead.bounces, seed) for seed in (self.seed, shifted_seed(self.seed, 2**62))]
+        # How fast noise falls is seen by a quarter of the paths; of a first look there are too few.
+        for walked in [range(paths)] if ahead.refined else [range(paths // 4), range(paths // 4, paths)]:
+            pair = [bake.walk(ahead.tracer, walked) for bake in pair]
+            clock.append(time.perf_counter())
+            (one, covered), (other, _) = (near.read(bake.samples) for bake in pair)
+            parts.append(parts_of(one, other, covered, fewer, self.reference))
+        longest, first, last = max(max(spec.shape) for spec in ahead.specs), parts[0], parts[-1]
+        if ahead.refined:
+            asking, walking, reading = np.diff([*clock, time.perf_counter()]) / max(1, len(near.asked))
+            pace, grid = Pace(asking + reading / 2, walking / (2 * paths)), (longest - 1 >> ahead.refined["levels"]) + 1
+            return Measured(grid, near.nodes, last, paths, pace=pace)
         falls = np.log(first.noise / last.noise) / np.log(4) if min(first.noise, last.noise) > 0 else 1.0
-        grid = max(max(spec.shape) for spec in specs)
-        return Measured(grid, around.nodes, last, paths, float(np.clip(falls, 0.8, 1.6)))
-
-    def measure_looked(self, longest: int, ahead: Ahead, bounces: int, fewer: Reference, paths: int) -> Measured:
-        """The error of a run whose nodes a first look at a lattice chose: see `measure`."""
-        clock = [time.perf_counter()]
-        around = Around(self.scene, ahead, self.reference.queries)
-        clock.append(time.perf_counter())
-        pair = self._walked(around, ahead.tracer, bounces, range(paths))
-        clock.append(time.perf_counter())
-        parts = self._parts(around, pair, fewer)
-        clock.append(time.perf_counter())
-        asking, walking, reading = np.diff(clock) / max(1, len(around.asked))
-        pace = Pace(asking + reading / 2, walking / (2 * paths))
-        return Measured(longest, around.nodes, parts, paths, looked=True, pace=pace)
-
-    def _walked(self, around: Corners | Around, tracer: Tracer, bounces: int, paths: range) -> list[Bake]:
-        seeds = self.seed, shifted_seed(self.seed, 2**62)
-        return [Bake.of([around.asked], bounces, seed).walk(tracer, paths) for seed in seeds]
-
-    def _parts(self, around: Corners | Around, pair: Sequence[Bake], fewer: Reference) -> Parts:
-        (one, covered), (other, _) = (around.read(bake.samples) for bake in pair)
-        return parts_of(one, other, covered, fewer, self.reference)
+        return Measured(longest, near.nodes, last, paths, float(np.clip(falls, 0.8, 1.6)))

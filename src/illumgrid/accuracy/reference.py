@@ -26,7 +26,6 @@ class Reference:
 
     tracer: Tracer
     halves: tuple[Bake, Bake]  # of one batch of points each, without holes; as many paths in both
-    surface: str = "levelset"  # that stands for the level sets: trilinear, or "mesh" (marching cubes)
 
     def __len__(self) -> int:
         return len(self.queries)

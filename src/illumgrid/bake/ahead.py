@@ -30,6 +30,7 @@ class Ahead:
     cached: bool = False  # whether paths end in light that is known
     refined: dict[str, Any] | None = None  # the nodes that a first look chose
     paths: int = PATHS
+    bounces: int = 0  # that its paths follow
     name: str = ""  # of what was lit ahead
 
 
@@ -43,13 +44,13 @@ def light_ahead(
     if cached and not in_look:
         ending = light_known_first(scene, specs, levels, tracer, bounces=bounces, **how)
     if not refining:
-        return Ahead(specs, stages[0], ending, stages[2], cached, name="cache" if cached else "")
+        return Ahead(specs, stages[0], ending, stages[2], cached, bounces=bounces, name="cache" if cached else "")
     nodes = chosen(scene, specs, halvings(specs), ending, bounces=2 * bounces, **how)
     if in_look:
         ending = ending_in(cache_of(scene, nodes.looked, (), ROUGH), tracer)  # what is lit more finely ends none
     return Ahead(
         [finer(spec, nodes.levels) for spec in specs], Chosen(nodes.flat), ending, Nested(nodes.levels),
-        cached or in_look, written(nodes, specs), paths_for(nodes, specs), "look",
+        cached or in_look, written(nodes, specs), paths_for(nodes, specs), bounces, "look",
     )  # fmt: skip
 
 

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from illumgrid import registry
 from illumgrid.accuracy.chart import Report
 from illumgrid.accuracy.chart.race import Point
 from illumgrid.accuracy.reference import Reference, errors
@@ -99,6 +100,9 @@ def options(record: Record, bounces: int) -> str:
         words.append(f"--isovalues {count}")
     if record["options"]["backend"].get("surface") == "mesh":
         words.append("--set backend.surface=mesh")
+    usual = asdict(registry.make("interpolator", record["interpolator"], {}))
+    changed = record["options"]["interpolator"].items() - usual.items()
+    words += [f"--set interpolator.{name}={value}" for name, value in sorted(changed)]
     return " ".join([*words, f"--grid {record['grid']} --paths {record['paths']} --bounces {bounces}"])
 
 

@@ -8,6 +8,7 @@ from itertools import product
 import numpy as np
 
 from illumgrid import registry, tone
+from illumgrid.accuracy.around import lattice
 from illumgrid.accuracy.chart.contestants import Method, methods, tracers
 from illumgrid.accuracy.chart.race import SEEDS, Flip, Point, Race, front
 from illumgrid.accuracy.cost import measure_pace
@@ -15,17 +16,21 @@ from illumgrid.accuracy.points import unseen_on_level_sets
 from illumgrid.accuracy.probe import Measured, Probe
 from illumgrid.accuracy.reference import Reference, begin, converge
 from illumgrid.bake.accumulator import Progress
-from illumgrid.bake.ahead import refinable_by
+from illumgrid.bake.ahead import by_normal_in, refinable_by
 from illumgrid.bake.bounces import enough_bounces, light_left_out
 from illumgrid.bake.refined import LOOKED
-from illumgrid.constants import BASE, PATHS
+from illumgrid.constants import BASE, DENSITY, PATHS, PATHS_BY_NORMAL
 from illumgrid.errors import BadInput
 from illumgrid.field.lattice import specs_over
 from illumgrid.field.scene import Scene
+from illumgrid.grid import GridSpec
 from illumgrid.grid.nodes import reachable
+from illumgrid.interpolators.bilateral import Bilateral
+from illumgrid.interpolators.nearest import Nearest
 from illumgrid.interpolators.nested import Nested
 from illumgrid.rng import shifted_seed
 from illumgrid.samplers.direct import Direct
+from illumgrid.stages import Interpolator
 from illumgrid.transport.samples import Queries
 from illumgrid.transport.tracer import Tracer, prepare
 
@@ -153,16 +158,16 @@ def _references(
         spent = time.perf_counter() - begun
         if len(reference):
             pace = pace or spent / (64 * len(asked))
-            found[surface] = _thinned(reference, surface, spent, REFERENCES * budget / len(surfaces), seed)
+            found[surface] = _thinned(reference, spent, REFERENCES * budget / len(surfaces), seed)
     return found, pace
 
 
-def _thinned(reference: Reference, surface: str, spent: float, left: float, seed: int) -> Reference:
+def _thinned(reference: Reference, spent: float, left: float, seed: int) -> Reference:
     """As many points of a reference, which took so many seconds, as can be sharpened to GOAL in the time left."""
     takes = spent * (reference.error / GOAL) ** 2
     keep = int(np.clip(len(reference) * left / max(takes, 1e-9), min(FEWEST, len(reference)), len(reference)))
     chosen = np.sort(np.random.default_rng((seed, 4)).permutation(len(reference))[:keep])
-    return replace(reference[chosen], surface=surface)
+    return reference[chosen]
 
 
 def _sharpen(references: dict[str, Reference], error: dict[str, float], left: float) -> None:
@@ -174,51 +179,44 @@ def _sharpen(references: dict[str, Reference], error: dict[str, float], left: fl
 
 
 def _show_default(race: Race, grid: int | None, paths: int | None, budget: float) -> list[str]:
-    """Chart `run`'s default; if it would take too much of the budget, predict it."""
-    own = registry.auto_backend()
-    entrants = [c.method for c in race.contestants if c.method.surface == "levelset"]
-    method = next((m for m in entrants if m.sampler == Direct() and m.backend.name == own), None)
-    nearest = next((i for i in method.interpolators if i.name == "nearest"), None) if method else None
-    if method is None or nearest is None:
+    """Chart `run`'s default; if it would take too much of the budget, predict it, or leave it out."""
+    scene, own = race.scene, registry.auto_backend()
+    able = (c.method for c in race.contestants if (c.method.surface, c.method.sampler) == ("levelset", Direct()))
+    method = plain = next((m for m in able if m.backend.name == own and Nearest() in m.interpolators), None)
+    if method is None or plain is None:
         return []
-    if grid is None and paths is None and refinable_by(race.scene, method.sampler, method.backend, nearest):
-        return _show_looked(race, replace(method, interpolators=(Nested(),), denser=None, looked=True), budget)
-    paths = paths or PATHS
-    shapes = {max(spec.shape) for spec in specs_over(race.scene, grid)}
-    grid = shapes.pop() if len(shapes) == 1 else grid  # else fields of different size, each with its own default
-    begun = time.perf_counter()
-    pace = measure_pace(race.scene, method.tracer, specs_over(race.scene, grid), 16, race.bounces, race.seed)
+    filler: Interpolator = Nearest()
+    if grid is None and paths is None and refinable_by(scene, plain.sampler, plain.backend, filler):
+        filler = Nested()
+        method = replace(plain, interpolators=(filler,), denser=None, looked=True)
+    elif grid is None and by_normal_in(scene, plain.sampler, plain.backend, filler):
+        filler, paths = Bilateral(1.0), paths or PATHS_BY_NORMAL
+        method = replace(plain, interpolators=(filler,), denser=None)
+    base = specs_over(scene, grid, BASE if method.looked else DENSITY)
+    shapes, begun = {max(spec.shape) for spec in base}, time.perf_counter()
+    pace = measure_pace(scene, method.tracer, base, 16, race.bounces, race.seed)
 
-    def seconds(size: int | None, count: int) -> float:
-        fields = zip(race.scene.fields, specs_over(race.scene, size))
-        return pace.seconds(sum(len(reachable(field, spec)) for field, spec in fields), count)
+    def seconds(specs: Sequence[GridSpec], count: int) -> float:
+        return pace.seconds(sum(len(reachable(field, spec)) for field, spec in zip(scene.fields, specs)), count)
 
-    takes = seconds(grid, paths)
+    if method.looked:
+        takes = seconds(base, 2 * LOOKED)  # of twice the bounces
+        if takes > DEFAULT * budget:
+            return [f"run's default does not compete: its first look would take about {takes:.0f} s"]
+        takes *= 3  # the nodes that it chooses have as many paths and more to fill
+    else:
+        grid = shapes.pop() if len(shapes) == 1 else grid  # else fields of different size, each with its own default
+        takes = seconds(base, paths := paths or PATHS)
     if takes <= DEFAULT * budget:
-        race.show_default(method, nearest, grid, paths)
+        race.show_default(method, filler, grid, paths)
         return []
-    race.predict(method, nearest, grid, paths, takes, default=True)
-    more = [(seconds(size, count), size, count) for size in race.sizes[1:] for count in (8, 32, 128)]
-    for takes, size, count in sorted(more):
+    race.predict(method, filler, grid, paths, takes if method is plain else None, default=True)
+    more = [(seconds(specs_over(scene, n), count), n, count) for n in race.sizes[1:] for count in (8, 32, 128)]
+    for takes, size, count in sorted(more if method is plain else ()):
         # As many nodes as those of the default, and as many seeds.
         will = SEEDS * count * pace.path * 8 * len(race.references["levelset"])
         if (size, count) != (grid, paths) and time.perf_counter() - begun + will < PREDICTED * budget:
-            race.predict(method, nearest, size, count, takes)
-    return ["~ marks predicted times: only the nodes near reference points were computed"]
-
-
-def _show_looked(race: Race, method: Method, budget: float) -> list[str]:
-    """Chart `run`'s default where a first look chooses the nodes; predict it, or leave it out, if it is too costly."""
-    base = specs_over(race.scene, None, BASE)
-    pace = measure_pace(race.scene, method.tracer, base, 16, race.bounces, race.seed)
-    nodes = sum(len(reachable(field, spec)) for field, spec in zip(race.scene.fields, base))
-    look = pace.seconds(nodes, 2 * LOOKED)  # of twice the bounces
-    if 3 * look <= DEFAULT * budget:  # the nodes that it chooses have as many paths and more to fill
-        race.show_default(method, method.interpolators[0], None, None)
-        return []
-    if look > DEFAULT * budget:
-        return [f"run's default does not compete: its first look would take about {look:.0f} s"]
-    race.predict_looked(method)
+            race.predict(plain, filler, size, count, takes)
     return ["~ marks predicted times: only the nodes near reference points were computed"]
 
 
@@ -233,11 +231,11 @@ def measure_parts(
     each = path * (2 * 8 * sum(PARTS_PATHS) * len(sizes) + 2 * PARTS_REFERENCE)
     points = int(np.clip(seconds / 2 / each, *PARTS_POINTS))
     probe = Probe.start(scene, tracer, points, 0.004, shifted_seed(seed, 1), PARTS_REFERENCE)
-    fewer, found = probe.fewer(bounces), list[Measured]()
+    fewer, found = probe.reference.cut_off(bounces), list[Measured]()
     for paths, size in product(PARTS_PATHS, sizes):
         now = time.perf_counter()
         if now - begun + last <= seconds or not found:
-            found.append(probe.measure(specs_over(scene, size), fewer, paths))
+            found.append(probe.measure(lattice(specs_over(scene, size), tracer, fewer.bounces), fewer, paths))
             last = (time.perf_counter() - now) * (4 if size == sizes[-1] else 1.5)
     return sorted(found, key=lambda m: (m.grid, m.paths))
 

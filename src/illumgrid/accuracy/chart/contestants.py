@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -30,13 +30,15 @@ class Method:
     slow: float = 1.0  # what the backend takes, over what the fastest one takes
     looked: bool = False  # whether a first look chooses the nodes, as `run` does under a sky
 
-    def label(self, interpolator: Interpolator) -> str:
+    def label(self, interpolator: Any) -> str:
         """Name of a contestant, as the chart shows it."""
         count = getattr(self.sampler, "count", None)
-        sampler = self.sampler.name if count is None else f"{self.sampler.name} {count}"
+        sampler = (
+            "first look" if self.looked else self.sampler.name if count is None else f"{self.sampler.name} {count}"
+        )
         surface = f" ({self.surface})" if hasattr(self.backend, "surface") else ""
-        sampler = "first look" if self.looked else sampler
-        return f"{sampler}, {self.backend.name}{surface}, {interpolator.name}"
+        changed = [] if interpolator == type(interpolator)() else map(str, asdict(interpolator).values())
+        return f"{sampler}, {self.backend.name}{surface}, {' '.join([interpolator.name, *changed])}"
 
 
 def tracers(scene: Scene, asked: Queries, budget: float) -> tuple[list[Method], list[str]]:

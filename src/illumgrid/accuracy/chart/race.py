@@ -8,22 +8,19 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from illumgrid.accuracy.around import around, filled, looked
 from illumgrid.accuracy.chart.contestants import COUNTS, Method
-from illumgrid.accuracy.looked import Around, looked
 from illumgrid.accuracy.reference import Reference, errors, look_up
 from illumgrid.bake.accumulator import Bake
 from illumgrid.bake.ahead import Ahead
-from illumgrid.bake.targets import of_field
-from illumgrid.constants import BASE, DENSITY, PATHS
+from illumgrid.constants import BASE, DENSITY
 from illumgrid.errors import BadInput
 from illumgrid.field.lattice import specs_over
 from illumgrid.field.scene import Scene
 from illumgrid.field.volume import Floats
-from illumgrid.grid import GridSpec, IlluminationGrid, Nodes
+from illumgrid.grid import IlluminationGrid
 from illumgrid.rng import shifted_seed
-from illumgrid.samplers.direct import corners
 from illumgrid.stages import Interpolator
-from illumgrid.transport.stages import fill_nodes
 
 STEPS = (8, 32, 128, 512, 2048)  # paths; `run`'s default is one of them
 SEEDS = 3
@@ -68,10 +65,10 @@ class Run:
 
     def __init__(self, scene: Scene, method: Method, grid: int | None, bounces: int, seed: int) -> None:
         self.scene, self.method, self.grid, self.seed = scene, method, grid, seed
-        self.specs: Sequence[GridSpec] = specs_over(scene, grid, BASE if method.looked else DENSITY)
-        self.longest = max(max(spec.shape) for spec in self.specs)
+        specs = specs_over(scene, grid, BASE if method.looked else DENSITY)
+        self.longest = max(max(spec.shape) for spec in specs)
+        self.ahead = Ahead(specs, method.sampler, method.tracer, method.interpolators[0], bounces=bounces)
         self.bake = Bake.of([], bounces, seed)
-        self.ahead: Ahead | None = None
         self.asking = self.tracing = 0.0
         self.interpolators = method.interpolators
         self.step = 0  # of STEPS, the next one; beyond them, or none, where it has come to its end
@@ -80,32 +77,31 @@ class Run:
         self.factor = method.slow  # what the slowdown of `ranked_by` is multiplied by
         self.ranked_by: Sequence[Point] = ()  # its own last points, or at first those of the one that it came from
 
+    def look(self) -> Ahead:
+        """Take the first look of a method that has one."""
+        if self.method.looked:
+            self.ahead = looked(self.scene, self.method.tracer, self.grid, None, self.seed)
+        return self.ahead
+
     def go_on(self, paths: int | None) -> None:
         """Trace until each query has so many paths, by default as many as `run` takes after a first look."""
         begun = time.perf_counter()
         if not self.bake.targets:
-            sampler, bounces = self.method.sampler, self.bake.bounces
-            if self.method.looked:
-                self.ahead, bounces = looked(self.scene, self.method.tracer, self.grid, None, self.seed)
-                self.specs, sampler = self.ahead.specs, self.ahead.sampler
-            asked = [q for q in sampler.queries(self.scene, self.specs, self.seed) if len(q)]
-            self.bake = Bake.of(asked, bounces, self.seed)
+            ahead = self.look()
+            asked = [q for q in ahead.sampler.queries(self.scene, ahead.specs, self.seed) if len(q)]
+            self.bake = Bake.of(asked, ahead.bounces, self.seed)
             self.asking = time.perf_counter() - begun
             begun = time.perf_counter()
-        paths = paths or (self.ahead.paths if self.ahead else PATHS)
+        paths = paths or self.ahead.paths
         if paths > self.bake.paths:
-            tracer = self.ahead.tracer if self.ahead else self.method.tracer
-            self.bake = self.bake.walk(tracer, range(self.bake.paths, paths))
+            self.bake = self.bake.walk(self.ahead.tracer, range(self.bake.paths, paths))
             self.tracing += time.perf_counter() - begun
 
     def fill(self, interpolator: Interpolator) -> tuple[list[IlluminationGrid], float]:
         """Grids from the samples so far, and the seconds that the interpolator took."""
         begun = time.perf_counter()
-        grids, interpolator = [], self.ahead.interpolator if self.ahead else interpolator
-        for number, spec in enumerate(self.specs):
-            own = of_field(self.scene, self.bake.answers, number)
-            grids.append(fill_nodes(interpolator, own, Nodes(spec, self.scene.fields[number], number)))
-        return grids, time.perf_counter() - begun
+        ahead = self.ahead if self.method.looked else replace(self.ahead, interpolator=interpolator)
+        return filled(self.scene, ahead, self.bake.answers), time.perf_counter() - begun
 
 
 def front(points: Iterable[Point], references: dict[str, Reference]) -> list[Point]:
@@ -147,11 +143,11 @@ class Race:
     def _run(self, method: Method, grid: int | None, again: int = 0) -> Run:
         return Run(self.scene, method, grid, self.bounces, shifted_seed(self.seed, again))
 
-    def show_default(self, method: Method, nearest: Interpolator, grid: int | None, paths: int | None) -> None:
+    def show_default(self, method: Method, filler: Interpolator, grid: int | None, paths: int | None) -> None:
         """Chart what `run` does when nothing is asked for, before all others; it goes on from there."""
         run = self._run(method, grid)
         run.go_on(paths)
-        point, _ = self._point(run, nearest)
+        point, _ = self._point(run, filler)
         point.default = True
         self.points.append(point)
         run.step, run.factor, run.ranked_by = sum(fewer < point.paths for fewer in STEPS), 1.0, [point]
@@ -159,33 +155,23 @@ class Race:
         self.contestants.append(run)
 
     def predict(
-        self, method: Method, nearest: Interpolator, grid: int | None, paths: int, takes: float, default: bool = False
-    ) -> None:
-        """Chart a grid of `Direct` by the nodes around the points, which hold what they would in all of it."""
-        specs = specs_over(self.scene, grid)
-        around = corners(self.scene, specs, self.references[method.surface].queries)
-        bakes = [Bake.of([around.asked], self.bounces, shifted_seed(self.seed, k)) for k in range(SEEDS)]
-        found = [around.read(bake.walk(method.tracer, range(paths)).samples) for bake in bakes]
-        longest = max(max(spec.shape) for spec in specs)
-        point = Point(method, nearest, grid, paths, around.nodes, found[0][1], longest, default=default, built=False)
-        point.seconds, point.light = [takes] * len(found), [light for light, _ in found]
-        self.points.append(point)
+        self, method: Method, filler: Interpolator, grid: int | None, paths: int | None, takes: float | None,
+        default: bool = False,
+    ) -> None:  # fmt: skip
+        """Chart a run by the nodes around the points, which hold what they would in all of it; one seed after a look.
 
-    def predict_looked(self, method: Method) -> None:
-        """Chart what `run` does after a first look, by the nodes around the points; the look is as in the run."""
-        (filler,), surface = method.interpolators, method.surface
-        scene, begun = self.scene, time.perf_counter()
-        ahead, bounces = looked(scene, method.tracer, None, None, self.seed)
-        look, reference = time.perf_counter() - begun, self.references[surface]
-        around = Around(scene, ahead, reference.queries)
-        walk = time.perf_counter()
-        bake = Bake.of([around.asked], bounces, self.seed).walk(ahead.tracer, range(ahead.paths))
-        light, read = around.read(bake.samples)
-        takes = look + (time.perf_counter() - walk) * around.nodes / len(around.asked)
-        longest = max(max(spec.shape) for spec in specs_over(scene, None, BASE))
-        point = Point(method, filler, None, ahead.paths, around.nodes, read, longest, default=True, built=False)
-        point.seconds, point.light = [takes], [light]
-        self.points.append(point)
+        Seconds that are not known are predicted from what these nodes take.
+        """
+        run, begun = self._run(method, grid), time.perf_counter()
+        ahead, reference = run.look(), self.references[method.surface]
+        look, paths = time.perf_counter() - begun, paths or ahead.paths
+        near = around(self.scene, ahead if method.looked else replace(ahead, interpolator=filler), reference.queries)
+        seeds, begun = range(1 if method.looked else SEEDS), time.perf_counter()
+        bakes = [Bake.of([near.asked], ahead.bounces, shifted_seed(self.seed, k)) for k in seeds]
+        found = [near.read(bake.walk(ahead.tracer, range(paths)).samples) for bake in bakes]
+        takes = takes or look + (time.perf_counter() - begun) / len(seeds) * near.nodes / len(near.asked)
+        point = Point(method, filler, grid, paths, near.nodes, found[0][1], run.longest, default=default, built=False)
+        self.points.append(replace(point, seconds=[takes] * len(seeds), light=[light for light, _ in found]))
 
     def advance(self, run: Run) -> None:
         """Take the next step of a contestant, and fill the grid by every interpolator."""
