@@ -2,14 +2,17 @@
 
 import math
 import pickle
+import weakref
 
 import numpy as np
 import pytest
 
 import illumgrid as ig
 import naive
+from illumgrid import bake
 from illumgrid.backends.numba_ import Numba
 from illumgrid.backends.reference import Reference
+from illumgrid.bake import ahead
 from illumgrid.bake.ahead import light_ahead
 from illumgrid.bake.bounces import enough_bounces
 from illumgrid.bake.known import MOST_BIAS, light_known_first
@@ -25,6 +28,7 @@ from illumgrid.interpolators.nearest import Nearest
 from illumgrid.samplers.direct import Direct
 from illumgrid.stages import on_level_sets
 from illumgrid.transport.samples import Queries, join_queries
+from illumgrid.transport.stages import fill_nodes
 from illumgrid.transport.tracer import ending_in, prepare
 from rooms import ROOMS, on_quads
 from shapes import ball
@@ -224,3 +228,22 @@ def test_a_run_lights_a_coarse_grid_first_where_light_needs_many_bounces():
     np.testing.assert_array_equal(one.grids[0].values, other.grids[0].values)
     for scene, bounces in ((room, one.recipe["bounces"]), (Scene.sky(ball(8)), None)):
         assert not ig.run(scene, bounces=bounces, **options).recipe["cache"]
+
+
+def test_a_cache_goes_when_the_paths_that_end_in_it_are_walked(monkeypatch):
+    caches, left = [], []
+
+    def ending(*about, **how):
+        tracer = light_known_first(*about, **how)
+        caches.append(weakref.ref(tracer.cache.light))
+        return tracer
+
+    def fill(*about):
+        left.append([cache() is not None for cache in caches])
+        return fill_nodes(*about)
+
+    monkeypatch.setattr(ahead, "light_known_first", ending)
+    monkeypatch.setattr(bake, "fill_nodes", fill)
+    scene = ig.Scene.box(ball(12), range=(0.3, 1.2))
+    assert ig.run(scene, grid=12, paths=2, judge=False).recipe["cache"]
+    assert left == [[], [False]]  # the coarse grid of the cache, and what was lit with it

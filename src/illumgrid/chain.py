@@ -181,8 +181,9 @@ def run(
         fixed = None if isinstance(walked, Iterator) else max(r.stop for r in walked)
         about = {"cache": ahead.cached, "grid": grid, "bounces": bounces, "left_out": left_out, "paths": fixed}
         keep.choose({**about, "refined": ahead.refined, "by_normal": bool(by_normal), "plan": plan})
+    ending, ahead = [ahead.tracer], replace(ahead, tracer=tracer)  # light that paths end in goes when they are walked
     baked = bake(
-        scene, ahead.specs, levels, ahead.sampler, ahead.tracer, ahead.interpolator,
+        scene, ahead.specs, levels, ahead.sampler, ending.pop(), ahead.interpolator,
         paths=walked, bounces=bounces, seed=seed, map=map, progress=progress, keep=keep,
     )  # fmt: skip
     _note_holes(scene, baked)

@@ -128,7 +128,7 @@ def bake(
         state = state.walk(tracer, numbers, map, progress, keep, ranks, choose)
     if keep is not None and state.answers:
         keep.end(state.answers)
-    del ranks
+    del ranks, tracer
     clock.append(time.perf_counter())
 
     grids, walked = [], state.paths
