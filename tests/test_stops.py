@@ -172,6 +172,13 @@ def test_a_library_that_does_not_look_for_signals_is_not_waited_for(tmp_path, st
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows waits for no pipe")
+def test_a_server_that_a_library_or_a_busy_machine_holds_up_ends_normally(tmp_path):
+    work = "from illumgrid.cli.stops import ends_normally\n        with ends_normally(): "
+    work += "print('begun', flush=True), hashlib.pbkdf2_hmac('sha256', b'', b'', 1 << 30)"
+    assert native(tmp_path, signal.SIGINT, work) == (0, "", ["command.py"])
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows waits for no pipe")
 def test_a_stop_within_a_callback_is_not_lost(tmp_path):
     """Libraries in C drop what a callback raises: LLVM calls one for each function that is compiled."""
     call = "lambda: (print('begun', flush=True), time.sleep(1000))"

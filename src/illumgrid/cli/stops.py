@@ -11,8 +11,8 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from types import FrameType
 
 from illumgrid.io import disk
@@ -24,6 +24,7 @@ AGAIN = 1.0
 
 unanswered = [0]
 """The signal that nobody has answered."""
+_normal = [False]
 
 
 def listen(numbers: Sequence[int]) -> None:
@@ -76,9 +77,23 @@ def answered() -> None:
     unanswered[0] = 0
 
 
+@contextmanager
+def ends_normally() -> Iterator[None]:
+    """A stop within this is the normal end of a command, such as that of a server: exit 0, and nothing to say."""
+    _normal[0] = True
+    try:
+        with suppress(KeyboardInterrupt):
+            yield
+        answered()
+    finally:
+        _normal[0] = False
+
+
 def _end() -> None:
     for place in list(disk.begun):
         shutil.rmtree(place, ignore_errors=True)
+    if _normal[0]:
+        os._exit(0)
     with suppress(OSError, ValueError):
         clear = "\r\x1b[2K\x1b[?25h" if sys.stderr.isatty() else ""  # a bar of progress, which hides the cursor
         os.write(sys.stderr.fileno(), f"{clear}{sentence()}\n".encode(errors="backslashreplace"))

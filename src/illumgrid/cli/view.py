@@ -1,6 +1,5 @@
 """``illumgrid view``: sweep the isovalue of a finished run interactively."""
 
-from contextlib import suppress
 from pathlib import Path
 from typing import Annotated
 
@@ -10,7 +9,7 @@ from illumgrid.cli.lights import SkyImage, Turn, Weights, relit
 from illumgrid.cli.long import loaded
 from illumgrid.cli.looks import Color, ColorMap, ColorRange, Look, looking, tint_of
 from illumgrid.cli.reading import given
-from illumgrid.cli.stops import answered
+from illumgrid.cli.stops import ends_normally
 from illumgrid.cli.terminal import reported_warnings, say
 from illumgrid.errors import BadInput
 
@@ -90,6 +89,5 @@ def view(
             from illumgrid.cli.lazily import browse
 
             browse(server.address)
-        with suppress(KeyboardInterrupt):  # the normal end of a server: exit 0
+        with ends_normally():
             server.serve_forever()
-        answered()
