@@ -132,6 +132,8 @@ def main():
     parser.add_argument("--no-default", action="store_true", help="only the settings of --try")
     parser.add_argument("--json", type=Path)
     asked = parser.parse_args()
+    if not asked.volumes.is_dir():
+        parser.error(f"there is no folder {asked.volumes}; expected --volumes and the folder of the files")
     warnings.simplefilter("ignore")
     figures = {}
     studio = {file.name: None for file in sorted(asked.volumes.glob("*.*")) if file.name != "SOURCES.md"}
