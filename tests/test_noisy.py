@@ -67,6 +67,7 @@ def test_a_run_of_noisy_data_that_was_stopped_goes_on_to_the_same_bits(call, mon
     one, other = ig.load("whole"), ig.load("out")
     np.testing.assert_array_equal(one.grids[0].light, other.grids[0].light)
     assert other.recipe["by_normal"] and other.recipe["paths"] == 16
+    assert "nothing is left to do" in call(*command, "-o", "out", "--resume")
     assert "16 paths" in call(*command, "--paths", "32", "-o", "out", "--resume")
     more, fresh = ig.load("out"), (call(*command, "--paths", "32", "-o", "fresh"), ig.load("fresh"))[1]
     np.testing.assert_allclose(more.grids[0].light, fresh.grids[0].light, rtol=1e-4, atol=1e-6)

@@ -216,11 +216,16 @@ def _paths_of(
 ) -> Iterable[range]:  # fmt: skip
     """Numbers of the paths to walk: `few` where nothing else is said."""
     if before:
-        again = before["paths"] if before.get("refined") or before.get("by_normal") else PATHS
-        return _gone_on_with(before, None if error or seconds else paths or again)
+        return _gone_on_with(before, None if error or seconds else paths or usual_paths(before))
     if plan and seconds is not None and paths is None:
         return rounds(plan["paths"], plan["fill"], begun + seconds)
     return [range(plan["paths"] if plan else paths or few)]
+
+
+def usual_paths(before: dict[str, Any]) -> int:
+    """Paths of a run that goes on where no number is asked for: those that it has chosen by itself, or the default."""
+    chosen: int = before["paths"] if before.get("refined") or before.get("by_normal") else PATHS
+    return chosen
 
 
 def _whole_numbers(paths: Any, bounces: Any, seed: Any) -> tuple[int | None, int | None, int]:

@@ -5,8 +5,6 @@ from numpy.typing import NDArray
 
 WHITE = 0.8
 """Display radiance up to which the tone curve changes nothing; sRGB 231 of 255."""
-
-
 DIRECTED = 0.66
 """Radiance of highlights under light from one side: sRGB 212 leaves the forms on the lit side their shades. In default
 previews of 13 volumes the 95th percentile of the object's pixels then lies at 195 to 213."""
@@ -14,23 +12,23 @@ BRIGHT = 0.1
 """Share of the nodes, or under light from one side of the light, above highlights."""
 
 
-def automatic_exposure(irradiance: NDArray[np.floating], albedo: NDArray[np.floating], directed: bool = False) -> float:
+def automatic_exposure(irradiance: NDArray[np.floating], albedo: NDArray[np.floating]) -> float:
     """Factor on albedo/π · irradiance, (n, 3) each, under which a picture is neither dark nor burnt out.
 
     Under the median light a colour given as albedo comes out as that colour, unless the highlights would then exceed
-    the radiance `WHITE`, or `DIRECTED`: see `exposure_under`. 1 if all is dark.
+    the radiance `WHITE`: see `exposure_under`. 1 if all is dark.
     """
     if not len(irradiance):
         return 1.0
-    return exposure_under(np.median(irradiance.mean(axis=1)), (irradiance * albedo).max(axis=1), directed)
+    return exposure_under(np.median(irradiance.mean(axis=1)), (irradiance * albedo).max(axis=1))
 
 
 def exposure_under(median: float, brightest: NDArray[np.floating], directed: bool = False) -> float:
     """As `automatic_exposure`, from the median irradiance and the brightest channels (n,) of albedo · it, sorted here.
 
-    Highlights are above the light that a tenth of the nodes exceed. Under light from one side, whose brightness has a
-    bound, they are the brightest tenth of all light: nodes hidden in folds and noise, which nobody sees, are dark and
-    many, but hold little of it.
+    Highlights are above the light that a tenth of the nodes exceed. Under light from one side (`directed`), whose
+    brightness has a bound, they start at `DIRECTED` and are the brightest tenth of all light: nodes hidden in folds and
+    noise, which nobody sees, are dark and many, but hold little of it.
     """
     brightest.sort()
     if directed:

@@ -45,12 +45,13 @@ def kept(
     **numbers: Any,
 ) -> "Partial | None":  # fmt: skip
     """What keeps the light of a run on the way, with all that an earlier one left; None if nothing is left to do."""
+    from illumgrid.chain import usual_paths
     from illumgrid.constants import PATHS
     from illumgrid.io import store
     from illumgrid.io.identity import identity
     from illumgrid.io.partial import Partial
 
-    planned = numbers["error"] is not None or numbers["seconds"] is not None
+    planned, asked = numbers["error"] is not None or numbers["seconds"] is not None, numbers["paths"]
     numbers["paths"] = None if planned else numbers["paths"] or PATHS
     about = identity(scene, stages, **numbers)
     command = shlex.join(["illumgrid", *sys.argv[1:]])
@@ -63,7 +64,7 @@ def kept(
     done = max((stop for _, stop in (partial.chosen or {})["walked"]), default=0)
     if partial.place.is_dir():
         say(f"going on with {partial.place}")
-    elif planned or done >= numbers["paths"]:
+    elif planned or done >= (asked or usual_paths(partial.chosen or {})):
         return None
     else:
         say(f"going on with the {done} paths of {folder}")
