@@ -142,21 +142,12 @@ def test_the_measured_noise_is_that_of_two_built_grids():
     scene, nodes = FIELDS["few bumps"](), 24
     probe = Probe.start(scene, prepare(BACKEND, scene), 1500, 0.05, 0)
     ahead = lattice(specs_over(scene, nodes), probe.reference.tracer, 3)
-    found = probe.measure(ahead, probe.reference.cut_off(3), 16)
+    found = probe.measure(ahead, 16)
     one, other = (
         look_up(run(scene, grid=nodes, paths=16, bounces=3, seed=s).grids, probe.reference.queries)[0] for s in (8, 9)
     )
     built = ((one - other) ** 2).mean() / 2 / probe.reference.mean**2
     assert found.parts.noise == pytest.approx(built, rel=0.25)
-
-
-def test_more_bounces_leave_less_out():
-    scene = FIELDS["labyrinth"]()
-    probe = Probe.start(scene, prepare(BACKEND, scene), 512, 0.05, 0)
-    left = [probe.left_out(bounces) for bounces in (0, 1, 2, 4, 8)]
-    assert left == sorted(left, reverse=True) and left[0] > 0.05
-    chosen = probe.bounces_for(0.01)
-    assert probe.left_out(chosen) <= 0.01 < probe.left_out(chosen - 1)
 
 
 def measured(grid, floor, noise=0.04, paths=16, nodes=None):
@@ -220,7 +211,7 @@ def test_the_probe_of_an_error_climbs_to_finer_grids_where_its_first_choice_will
     """The first look sees few points, and may find a grid good enough by chance."""
     scene, looks = FIELDS["few bumps"](), []
 
-    def lucky(probe, ahead, fewer, paths):
+    def lucky(probe, ahead, paths):
         grid = max(ahead.specs[0].shape)
         looks.append((len(probe.reference), grid))
         first = looks[0][0] == len(probe.reference)

@@ -110,9 +110,9 @@ def test_remedies_are_those_of_the_grids_as_they_are_and_of_the_option_as_it_is_
     scene, seen = ig.Scene(fields, background=np.ones(3)), []
     measure = Probe.measure
 
-    def watched(probe, ahead, fewer, paths):
+    def watched(probe, ahead, paths):
         seen.append([spec.shape for spec in ahead.specs])
-        return measure(probe, ahead, fewer, paths)
+        return measure(probe, ahead, paths)
 
     monkeypatch.setattr(Probe, "measure", watched)
     specs = specs_over(scene)

@@ -9,9 +9,9 @@ import numpy as np
 from illumgrid.accuracy.around import lattice, looked
 from illumgrid.accuracy.cost import Pace, measure_pace
 from illumgrid.accuracy.probe import FEWEST_PATHS, MOST_PATHS, Measured, Probe
-from illumgrid.accuracy.reference import Reference
 from illumgrid.accuracy.texels import Walls, walls_for
 from illumgrid.bake.ahead import Ahead
+from illumgrid.bake.bounces import enough_bounces
 from illumgrid.bake.walls import texel_paths, wall_queries
 from illumgrid.field.lattice import specs_over
 from illumgrid.field.scene import Levels, Scene, finer_texels
@@ -105,7 +105,6 @@ def choose(tried: Sequence[Measured], pace: Pace, goal: Goal) -> Choice:
 class Look:
     """Grids measured at some points with some bounces, and the best of them."""
 
-    probe: Probe
     points: int
     bounces: int
     choice: Choice
@@ -127,7 +126,7 @@ class Search:
     took: dict[int, float] = field(default_factory=dict)  # seconds of a look and of what was measured of it
 
     def look(
-        self, sizes: Sequence[int], points: int, error: float, seed: int, most: int, bounces: int | None = None,
+        self, sizes: Sequence[int], points: int, error: float, seed: int, most: int,
         kinds: Sequence[bool] = (False, True),
     ) -> Look:  # fmt: skip
         """Measure grids from coarse to fine at some points, until finer ones cannot be the choice.
@@ -135,14 +134,15 @@ class Search:
         First lattices, then nodes that first looks choose.
         """
         probe = Probe.start(self.scene, self.tracer, points, error, seed, most)
-        bounces = self.goal.bounces if bounces is None else bounces
-        followed = probe.bounces_for(SHARE * error) if bounces is None else bounces
-        fewer, found, goal = probe.reference.cut_off(followed), list[Measured](), replace(self.goal, texels=0)
+        followed = self.goal.bounces
+        if followed is None:
+            followed, _ = enough_bounces(self.scene, self.tracer, seed, SHARE * error)
+        found, goal = list[Measured](), replace(self.goal, texels=0)
         for looking in kinds[: 1 + self.looking]:
             for left, size in zip(range(len(sizes), 0, -1), sizes):
                 if looking and self._too_late(size, found):
                     break
-                found.append(now := self._measured(probe, size, looking, fewer))
+                found.append(now := self._measured(probe, size, looking, followed))
                 pace = now.pace or self.pace
                 if pace.seconds(now.nodes, FEWEST_PATHS) > goal.seconds or now.nodes > MOST_NODES:
                     break
@@ -153,16 +153,15 @@ class Search:
                     hopeless = looking and now.floor > (2.0**left * goal.error) ** 2  # at best half the error each
                     if hopeless or (choice.met and least >= choice.seconds):
                         break
-        return Look(probe, points, followed, choose(found, self.pace, self.goal), tuple(found))
+        return Look(points, followed, choose(found, self.pace, self.goal), tuple(found))
 
-    def _measured(self, probe: Probe, size: int, looking: bool, fewer: Reference) -> Measured:
+    def _measured(self, probe: Probe, size: int, looking: bool, bounces: int) -> Measured:
         if not looking:
-            return probe.measure(lattice(specs_over(self.scene, size), self.tracer, fewer.bounces), fewer, TRIAL_PATHS)
+            return probe.measure(lattice(specs_over(self.scene, size), self.tracer, bounces), TRIAL_PATHS)
         begun = time.perf_counter()
         if size not in self.ahead:
             self.ahead[size] = looked(self.scene, self.tracer, size, self.goal.bounces, self.seed)
-        light = probe.reference if self.goal.bounces is None else fewer  # else paths have no end
-        found = probe.measure(self.ahead[size], light, LOOKED_PATHS)
+        found = probe.measure(self.ahead[size], LOOKED_PATHS)
         self.took[size] = time.perf_counter() - begun
         return found
 
@@ -205,11 +204,9 @@ class Search:
         if goal.error is None:  # after a slow first look, what is left is for the run
             more = 0 if late else int(min(8192.0, look.choice.seconds / 6 / each))
         while more > 1.5 * look.points:
-            error, bounces = goal.error or look.choice.error, None
-            if goal.error is None:  # by the few points of the first look: more would take too long
-                bounces = look.bounces if goal.bounces is not None else look.probe.bounces_for(SHARE * error)
             # More points tell more than a sharper reference at each: its variance is subtracted.
-            look, more = self.look(near, more, error, seed, 128, bounces, (look.choice.measured.looked,)), 0
+            error = goal.error or look.choice.error
+            look, more = self.look(near, more, error, seed, 128, (look.choice.measured.looked,)), 0
             if goal.error is not None and look.choice.measured.parts.uncertain > 0.05 * goal.error**2:
                 # A few points carry the error, as where the field is noisy: many more are needed to tell it.
                 more = int(min(4 * look.points, 16384, max(SOON, look.choice.seconds) / each))
@@ -255,7 +252,7 @@ def planned(
         goal = replace(goal, texels=sum(len(queries) for queries in fine))
     pilot = time.perf_counter() - begun
     choice = choose(look.tried, pace, replace(goal, seconds=left - pilot))
-    why = reasons(scene, choice, look.bounces, look.probe.left_out(look.bounces), walls)
+    why = reasons(scene, choice, look.bounces, walls)
     said = outlook(look.tried, pace, replace(goal, seconds=np.inf if seconds is None else seconds), choice, pilot)
     ahead = search.ahead[choice.measured.grid] if choice.measured.looked else None
     return Plan(
@@ -296,7 +293,7 @@ def _time(seconds: float) -> str:
     return f"{seconds:.0f} seconds" if seconds >= 9.5 else f"{seconds:.2g} seconds"
 
 
-def reasons(scene: Scene, choice: Choice, bounces: int, left_out: float, walls: Walls | None = None) -> tuple[str, ...]:
+def reasons(scene: Scene, choice: Choice, bounces: int, walls: Walls | None = None) -> tuple[str, ...]:
     """What was chosen, why, and what was left out, in sentences."""
     m, part = choice.measured, choice.measured.parts
     still, noise = np.sqrt(max(0.0, part.grid + part.uncovered)), np.sqrt(max(0.0, m.squared(choice.paths) - m.floor))
@@ -314,7 +311,7 @@ def reasons(scene: Scene, choice: Choice, bounces: int, left_out: float, walls: 
     return (
         f"{m.grid} nodes along the longest axis: interpolation between them is off by {still:.1%}",
         f"{choice.paths} paths: noise of {noise:.1%} after interpolation",
-        f"{bounces} bounces: further ones would add {left_out:.1%}",
+        f"{bounces} bounces: further ones would add {np.sqrt(part.bounces):.1%}",
         f"{nodes - m.nodes} of {nodes} nodes are omitted: no isosurface of the range is near them",
         *on_walls,
     )

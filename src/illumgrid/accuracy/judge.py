@@ -76,7 +76,6 @@ def remedies(scene: Scene, backend: Backend, specs: Sequence[GridSpec], bounces:
             probe = Probe.start(of, prepare(backend, of), 512, 0.05, seed, most=128)
         except BadInput:  # no light where it looked
             return {}
-        fewer = probe.reference.cut_off(bounces)
-        part = probe.measure(lattice(nodes, fewer.tracer, fewer.bounces), fewer, 32).parts
+        part = probe.measure(lattice(nodes, probe.reference.tracer, bounces), 32).parts
         found[what] = float(np.sqrt(max(0.0, part.total - part.noise)))
     return found

@@ -6,14 +6,14 @@ points: that measures the error of a grid without building it.
 """
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from illumgrid.accuracy.around import around
 from illumgrid.accuracy.cost import Pace
 from illumgrid.accuracy.points import unseen_in_volume
-from illumgrid.accuracy.reference import Parts, Reference, begin, converge, missing, parts_of
+from illumgrid.accuracy.reference import Parts, Reference, begin, converge, parts_of
 from illumgrid.bake.accumulator import Bake
 from illumgrid.bake.ahead import Ahead
 from illumgrid.bake.bounces import enough_bounces
@@ -23,7 +23,6 @@ from illumgrid.rng import shifted_seed
 from illumgrid.transport.tracer import Tracer
 
 FEWEST_PATHS, MOST_PATHS = 4, 1 << 16  # from each node of a planned run
-BOUNCES = (0, 1, 2, 3, 4, 5, 6, 8, 10, 12, 16, 20, 24, 32, 48, 64, 96, 128)
 
 
 @dataclass(frozen=True)
@@ -68,7 +67,7 @@ class Probe:
     scene: Scene
     seed: int
     reference: Reference
-    few: Reference  # some points with fewer paths: enough to see what bounces add, since both sides walk the same
+    fewer: dict[int, Reference] = field(default_factory=dict)  # the same with fewer bounces
 
     @classmethod
     def start(cls, scene: Scene, tracer: Tracer, points: int, error: float, seed: int, most: int = 1024) -> "Probe":
@@ -81,24 +80,21 @@ class Probe:
         first = begin(tracer, unseen_in_volume(scene, points, seed), followed, seed)
         if not first.mean > 0:
             raise BadInput("no light reaches the surfaces of this scene; expected a background or a lamp that does")
-        few = first[:: max(1, len(first) // 512)]
-        return cls(scene, seed, converge(first, error, most), few)
+        return cls(scene, seed, converge(first, error, most))
 
-    def left_out(self, bounces: int) -> float:
-        """Root mean square of the light that more bounces would add, relative."""
-        return float(np.sqrt((missing(self.few.cut_off(bounces), self.few) ** 2).mean()))
+    def cut_off(self, bounces: int) -> Reference:
+        """The reference by the same paths, ended after fewer bounces."""
+        if bounces not in self.fewer:
+            self.fewer[bounces] = self.reference.cut_off(bounces)
+        return self.fewer[bounces]
 
-    def bounces_for(self, tolerance: float) -> int:
-        """Fewest bounces that leave out less than a `tolerance`."""
-        most = self.reference.bounces
-        return next((b for b in BOUNCES if b < most and self.left_out(b) <= tolerance), most)
-
-    def measure(self, ahead: Ahead, fewer: Reference, paths: int) -> Measured:
-        """The error of a run before it is built, by `paths` paths from two seeds each; `fewer` has its bounces."""
+    def measure(self, ahead: Ahead, paths: int) -> Measured:
+        """The error of a run before it is built, by `paths` paths from two seeds each."""
         clock, parts = [time.perf_counter()], list[Parts]()
         near = around(self.scene, ahead, self.reference.queries)
         clock.append(time.perf_counter())
         pair = [Bake.of([near.asked], ahead.bounces, seed) for seed in (self.seed, shifted_seed(self.seed, 2**62))]
+        fewer = self.reference if ahead.cached else self.cut_off(ahead.bounces)  # where light is known, paths have no end
         # How fast noise falls is seen by a quarter of the paths; of a first look there are too few.
         for walked in [range(paths)] if ahead.refined else [range(paths // 4), range(paths // 4, paths)]:
             pair = [bake.walk(ahead.tracer, walked) for bake in pair]

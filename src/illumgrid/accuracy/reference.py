@@ -157,11 +157,6 @@ class Parts:
         return max(0.0, self.noise + self.grid + self.uncovered + self.bounces + self.cross)
 
 
-def missing(fewer: Reference, reference: Reference) -> Floats:
-    """Light (n, 3), relative, that the bounces beyond those of `fewer` add to the same paths."""
-    return (reference.light - fewer.light) / reference.mean
-
-
 def parts_of(one: Floats, other: Floats, covered: NDArray[np.bool_], fewer: Reference, reference: Reference) -> Parts:
     """Split the error of a grid, from what two that differ in their seeds hold, (n, 3), at the points of a reference.
 
@@ -170,7 +165,7 @@ def parts_of(one: Floats, other: Floats, covered: NDArray[np.bool_], fewer: Refe
     """
     light, mean = fewer.light, reference.mean
     first, second = (one - light) / mean, (other - light) / mean
-    more = missing(fewer, reference)
+    more = (reference.light - fewer.light) / reference.mean
     # The paths that stand for the exact light are in both errors: their own variance is subtracted.
     both = (first * second).mean(axis=1) - (fewer.off**2).mean(axis=1) / mean**2
     inside = np.where(covered, both, 0.0)

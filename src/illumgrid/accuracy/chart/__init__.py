@@ -93,7 +93,7 @@ def bench(
 
     asked = _unseen(scene, budget, seed)
     entrants, notes = tracers(scene, asked, budget)
-    bounces = Probe.start(scene, auto, 256, 0.02, seed, 64).bounces_for(0.002)
+    bounces, _ = enough_bounces(scene, auto, seed, 0.002)
     references, pace = _references(scene, entrants, asked, budget, seed, notes)
     _sharpen(references, dict.fromkeys(references, 4 * GOAL), 0.3 * REFERENCES * budget)
     reference = next(iter(references.values()))
@@ -231,11 +231,11 @@ def measure_parts(
     each = path * (2 * 8 * sum(PARTS_PATHS) * len(sizes) + 2 * PARTS_REFERENCE)
     points = int(np.clip(seconds / 2 / each, *PARTS_POINTS))
     probe = Probe.start(scene, tracer, points, 0.004, shifted_seed(seed, 1), PARTS_REFERENCE)
-    fewer, found = probe.reference.cut_off(bounces), list[Measured]()
+    found = list[Measured]()
     for paths, size in product(PARTS_PATHS, sizes):
         now = time.perf_counter()
         if now - begun + last <= seconds or not found:
-            found.append(probe.measure(lattice(specs_over(scene, size), tracer, fewer.bounces), fewer, paths))
+            found.append(probe.measure(lattice(specs_over(scene, size), tracer, bounces), paths))
             last = (time.perf_counter() - now) * (4 if size == sizes[-1] else 1.5)
     return sorted(found, key=lambda m: (m.grid, m.paths))
 
