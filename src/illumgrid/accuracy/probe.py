@@ -94,7 +94,7 @@ class Probe:
         near = around(self.scene, ahead, self.reference.queries)
         clock.append(time.perf_counter())
         pair = [Bake.of([near.asked], ahead.bounces, seed) for seed in (self.seed, shifted_seed(self.seed, 2**62))]
-        fewer = self.reference if ahead.cached else self.cut_off(ahead.bounces)  # where light is known, paths have no end
+        fewer = self.reference if ahead.cached else self.cut_off(ahead.bounces)  # in known light paths have no end
         # How fast noise falls is seen by a quarter of the paths; of a first look there are too few.
         for walked in [range(paths)] if ahead.refined else [range(paths // 4), range(paths // 4, paths)]:
             pair = [bake.walk(ahead.tracer, walked) for bake in pair]
