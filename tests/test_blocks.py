@@ -7,8 +7,10 @@ import pytest
 
 import illumgrid as ig
 from illumgrid.field.scene import level_table
-from illumgrid.grid import GREY, GridSpec, IlluminationGrid, Nodes
+from illumgrid.field.volume import slabs
+from illumgrid.grid import GREY, GridSpec, IlluminationGrid, Nodes, illumination
 from illumgrid.grid.blocks import SIDE, answer, beside_coarser, boxes, in_cells, laid_out, put
+from illumgrid.grid.cache import cache_of
 from illumgrid.grid.illumination import Held
 from illumgrid.grid.nested import finer
 from illumgrid.grid.nodes import reachable
@@ -108,6 +110,22 @@ def test_where_no_block_lies_the_border_of_the_nearest_is_read_and_nothing_is_co
     assert blocks.covered(points).tolist() == [True, False, False, False]
     assert np.isfinite(blocks.uncertainty(points)).tolist() == [True, False, False, False]
     assert blocks.support[19, 10, 17] == 0 and np.isinf(blocks.error[19, 10, 17]) and not blocks.dark.any()
+
+
+def test_thinned_light_and_a_cache_are_made_without_the_whole_lattice(monkeypatch):
+    scene = sky(ball(20), (0.1, 0.9))
+    spec = GridSpec.over(scene.fields[0].volume, 30)
+    dense = replace(random_grid(spec.shape, holes=0.02), spec=spec)
+    blocks, few = cut(dense), GridSpec.over(scene.fields[0].volume, 13)
+    whole, cache = dense.onto(few), cache_of(scene, [dense], [], alike=1.5)
+    monkeypatch.setattr(illumination, "_BLOCK", 1000)
+    monkeypatch.setattr(slabs, "__defaults__", (30 * 30 * 4,))
+    for name in ("light", "error", "support"):
+        np.testing.assert_allclose(getattr(blocks.onto(few), name), getattr(whole, name), rtol=1e-5, atol=2e-7)
+    parts = cache_of(scene, [blocks], [], alike=1.5)
+    assert 0.1 < cache.trusted.mean() < 0.9 and "_arrays" not in vars(blocks)
+    for one, other in zip(parts, cache):
+        np.testing.assert_array_equal(one, other)
 
 
 def test_a_grid_of_no_blocks_is_dark():

@@ -96,6 +96,14 @@ def test_queries_of_nodes_are_held_in_pieces(free):
     assert pieces < 110e6 and whole > 3 * pieces
 
 
+def test_so_are_those_that_are_read_by_level_and_normal(monkeypatch):
+    asked = []
+    monkeypatch.setattr(needs, "check_run", lambda *of, **options: asked.append(options["at_nodes"]))
+    for sampler in ("direct", "uniform"):
+        ig.run(sky(ball(8)), sampler=sampler, interpolator="bilateral", grid=4, paths=1, bounces=0, judge=False)
+    assert asked == [True, False]
+
+
 def test_an_isosurface_beyond_memory_is_refused_before_it_is_extracted(free, tmp_path):
     noise = Field("noise", Volume(np.random.default_rng(0).random((33, 20, 7))), range=(0.2, 0.8))
     crossed = sum(int((np.diff(noise.volume.values > 0.5, axis=axis)).sum()) for axis in range(3))

@@ -158,7 +158,7 @@ def run(
         chosen = chosen[0], chosen[1], Bilateral(1.0)
     specs = specs_over(scene, grid, BASE) if refining else specs_over(scene, grid)
     held = any(field.isovalue is not None for field in scene.fields)  # such rows are in no cache's sweep
-    at_nodes = not held and (chosen[0].name, chosen[2].name) == ("direct", "nearest")
+    at_nodes = not held and chosen[0].name == "direct" and chosen[2].name in ("nearest", "bilateral")
     density = getattr(chosen[2], "density", 1.0)
     needs.check_run(scene, specs, levels, density, at_nodes=at_nodes, refining=bool(refining))
     automatic = bounces is None or cached

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from illumgrid.errors import BadInput
 from illumgrid.field.levelset import Marchable
 from illumgrid.field.scene import Scene
+from illumgrid.field.storing import read_at_random
 from illumgrid.grid.cache import NO_CACHE, Cache
 from illumgrid.grid.channels import Channels
 from illumgrid.stages import Backend, hookimpl
@@ -125,7 +126,8 @@ class NumbaTracer:
         first = next(pieces)
         if not compiled(solve_queries, first[0]):
             beside(lambda: chunk(first[0], first[1][:0]))
-        share(self.threads, chunk, chain([first], pieces), stop)
+        with read_at_random([field.volume.stored for field in self.scene.fields]):
+            share(self.threads, chunk, chain([first], pieces), stop)
         return answer
 
     def _surfaces(self, level: NDArray[np.float64]) -> Iterator[tuple[Any, NDArray[np.int64]]]:

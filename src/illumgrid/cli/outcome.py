@@ -9,6 +9,7 @@ from shutil import rmtree
 from tempfile import gettempdir, mkdtemp
 from typing import TYPE_CHECKING, Any
 
+from illumgrid.cli.heap import return_holes
 from illumgrid.cli.stops import answered
 from illumgrid.cli.terminal import omitted_light, say
 from illumgrid.errors import tell
@@ -48,8 +49,10 @@ def finished(
     """Save the light of a run in place of what was kept on the way; then measure its error."""
     from illumgrid.io import store
 
+    return_holes()
     save(replace(light, recipe={**light.recipe, "warnings": sentences}), folder, preview, overwrite, source)
     keep.leave(folder)
+    return_holes()
     light = judged_light(light, stages, folder)
     about = {key: light.recipe[key] for key in ("reached", "reached_uncertain", "reached_on_walls")}
     store.amend(folder, {**about, "warnings": sentences})

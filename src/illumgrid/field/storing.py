@@ -1,5 +1,8 @@
 """What a volume stores of the values it is given: their own type, wherever that is small, and a slope and intercept."""
 
+import mmap
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -75,3 +78,26 @@ def _for_single_precision(values: NDArray[Any], slope: float, intercept: float) 
     middle = 0.0 if fits else low + span
     scale = float(2.0 ** np.clip(np.frexp(span)[1], -1022, 1022))
     return (wide - middle) / scale, slope * scale, intercept + slope * middle
+
+
+@contextmanager
+def read_at_random(arrays: Sequence[NDArray[Any]]) -> Iterator[None]:
+    """Of arrays that the system pages from a file, it reads single pages meanwhile, as rays ask for them.
+
+    Otherwise it reads some megabytes around each page, which it has to drop again where memory is scarce.
+    """
+    files = [file for file in map(_paged_from, arrays) if file is not None and hasattr(file, "madvise")]
+    for file in files:
+        file.madvise(mmap.MADV_RANDOM)
+    try:
+        yield
+    finally:
+        for file in files:
+            file.madvise(mmap.MADV_NORMAL)
+
+
+def _paged_from(values: Any) -> mmap.mmap | None:
+    """The mapped file that an array lies in, if any."""
+    while isinstance(values, np.ndarray):
+        values = values.base
+    return values if isinstance(values, mmap.mmap) else None

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from illumgrid.errors import BadInput
 from illumgrid.field.scene import Scene
-from illumgrid.field.volume import Floats
+from illumgrid.field.volume import Floats, slabs
 from illumgrid.grid.channels import channels_of
 from illumgrid.grid.illumination import IlluminationGrid
 from illumgrid.grid.walls import WallTexture
@@ -84,15 +84,20 @@ def cache_of(
                 f"the light of the cache has the channels {', '.join(lattice.channels.names)}; expected those of the "
                 f"scene: {', '.join(channels.names)}"
             )
-    light = [lattice.light.reshape(-1, len(channels)) for lattice in lattices]
-    trusted = [_alike(grid.channels.shown(grid.light).mean(axis=-1), grid.support > 0, alike) for grid in grids]
-    trusted += [_alike(wall.channels.shown(wall.light).mean(axis=-1), wall.support > 0, alike) for wall in walls]
+    light, trusted = [], []
+    for lattice in lattices:
+        if isinstance(lattice, IlluminationGrid):
+            found, lit = lattice.lattice()
+        else:
+            found, lit = lattice.light, lattice.support > 0
+        trusted.append(_alike(lattice.channels.shown(found).mean(axis=-1), lit, alike).reshape(-1))
+        light.append(found.reshape(-1, len(channels)))
     texel = [max(np.linalg.norm(q.edge_u) / q.texels[0], np.linalg.norm(q.edge_v) / q.texels[1]) for q in scene.quads]
     return Cache(
         light=light[0] if len(light) == 1 else np.concatenate(light),
-        trusted=np.concatenate([cells.reshape(-1) for cells in trusted]),
+        trusted=np.concatenate(trusted),
         start=np.cumsum([0, *map(len, light)], dtype=np.int64)[:-1],
-        shape=np.array([lattice.light.shape[:3] for lattice in lattices], np.int64),
+        shape=np.array([*(g.spec.shape for g in grids), *(w.light.shape[:3] for w in walls)], np.int64),
         origin=np.ascontiguousarray(scene.to_frame([grid.spec.origin for grid in grids])),
         spacing=np.array([grid.spec.spacing for grid in grids], float),
         near=np.array([*(grid.spec.spacing.max() for grid in grids), *texel], float),
@@ -103,11 +108,15 @@ def cache_of(
 
 def _alike(light: NDArray[np.float32], lit: NDArray[np.bool_], alike: float) -> NDArray[np.bool_]:
     """Cells (nx, ny, nz), named by their lowest node, whose nodes all have light, and much the same."""
-    low, high, good = light, light, lit
-    for axis in range(3):
-        ahead = np.minimum(np.arange(light.shape[axis]) + 1, light.shape[axis] - 1)
-        low = np.minimum(low, low.take(ahead, axis))
-        high = np.maximum(high, high.take(ahead, axis))
-        good = good & good.take(ahead, axis)
     mean = float(light[lit].mean(dtype=float)) if lit.any() else 0.0
-    return np.asarray(good & (high - low <= alike * mean))
+    found = np.empty(light.shape, bool)
+    for some in slabs(light.shape):
+        ahead = slice(some.start, some.stop + 1)
+        low, high, good = light[ahead], light[ahead], lit[ahead]
+        for axis in range(3):
+            other = np.minimum(np.arange(low.shape[axis]) + 1, low.shape[axis] - 1)
+            low = np.minimum(low, low.take(other, axis))
+            high = np.maximum(high, high.take(other, axis))
+            good = good & good.take(other, axis)
+        found[some] = (good & (high - low <= alike * mean))[: some.stop - some.start]
+    return found

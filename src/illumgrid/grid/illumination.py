@@ -115,6 +115,17 @@ class IlluminationGrid:
         for first in range(0, count, _BLOCK):
             yield slice(first, min(first + _BLOCK, count))
 
+    def lattice(self) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+        """Light (nx, ny, nz, C) of all nodes, and which have light: from blocks both are made anew, and not kept."""
+        held, shape = self.held, tuple(self.spec.shape)
+        if held.layout.dense:
+            return held.light[0], held.support[0] > 0
+        light, lit = np.empty((*shape, held.light.shape[4]), np.float32), np.empty(shape, bool)
+        for nodes in self._slabs():
+            some, _, support = self._at(nodes)
+            light.reshape(-1, light.shape[3])[nodes], lit.reshape(-1)[nodes] = some, support > 0
+        return light, lit
+
     def _at(self, nodes: slice) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
         """Light (m, C), error (m,) and support (m,) of some nodes of the finest lattice."""
         index = np.stack(np.unravel_index(np.arange(nodes.start, nodes.stop), self.spec.shape), axis=-1)
@@ -217,14 +228,19 @@ class IlluminationGrid:
 
     def onto(self, spec: GridSpec) -> "IlluminationGrid":
         """Grid on another lattice: light as `lookup` reads it, error and support those of the nearest node."""
-        points, held = spec.nodes(), self.held
-        light = read(held.layout, self.spec, held.light, points).reshape(*spec.shape, -1)
-        nearest = np.clip(np.round(world_to_index(self.spec, points)), 0, np.array(self.spec.shape) - 1)
+        held, count = self.held, int(np.prod(spec.shape))
         each = held.light[..., :0] if held.errors is None else held.errors
-        errors, error, support = answer(held.layout, each, held.error, held.support, nearest)
+        light, errors = (np.empty((count, of.shape[4]), np.float32) for of in (held.light, each))
+        error, support = np.empty((2, count), np.float32)
+        for first in range(0, count, _BLOCK):
+            some = slice(first, min(first + _BLOCK, count))
+            points = spec.nodes(np.arange(some.start, some.stop))
+            light[some] = read(held.layout, self.spec, held.light, points)
+            nearest = np.clip(np.round(world_to_index(self.spec, points)), 0, np.array(self.spec.shape) - 1)
+            errors[some], error[some], support[some] = answer(held.layout, each, held.error, held.support, nearest)
         return IlluminationGrid(
-            spec, light, error.reshape(spec.shape), support.reshape(spec.shape), self.channels,
-            None if held.errors is None else errors.reshape(light.shape),
+            spec, light.reshape(*spec.shape, -1), error.reshape(spec.shape), support.reshape(spec.shape), self.channels,
+            None if held.errors is None else errors.reshape(*spec.shape, -1),
         )  # fmt: skip
 
     @property

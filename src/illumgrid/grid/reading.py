@@ -17,6 +17,8 @@ RIDGE = 0.1  # of the weights' sum, in squared spacings: what holds back slopes 
 NEGLIGIBLE = 14.0  # a weight e^-14 of the largest is none
 NEAREST = 0.499  # spacings within which a hole of the lit lattice makes a hole; halfway the others decide
 REACH = 2.0 - 1e-4  # spacings along each axis from which on a sample has no weight
+STEPS, HOLD = 4, 0.5  # voxels along each axis: how often, and how far, a node beyond the range moves towards it
+MOVED = STEPS * HOLD
 MOST = 512  # samples that one point reads, at most
 
 
@@ -272,7 +274,7 @@ def fill(
                 continue
         h, gx, gy, gz = outward(values, a, b, c, sign, spacing)
         level = min(max(h, ends[0]), ends[1])
-        for _ in range(4):
+        for _ in range(STEPS):
             steep = gx * gx * spacing[0] ** 2 + gy * gy * spacing[1] ** 2 + gz * gz * spacing[2] ** 2
             if h == level or not steep > 0.0:
                 break
@@ -281,7 +283,7 @@ def fill(
             largest = max(abs(sx), abs(sy), abs(sz))
             if not largest < 1e9:
                 break
-            hold = min(1.0, 0.5 / largest) if largest > 0.0 else 1.0
+            hold = min(1.0, HOLD / largest) if largest > 0.0 else 1.0
             a = min(max(a + hold * sx, 0.0), values.shape[0] - 1.0)
             b = min(max(b + hold * sy, 0.0), values.shape[1] - 1.0)
             c = min(max(c + hold * sz, 0.0), values.shape[2] - 1.0)

@@ -1,30 +1,31 @@
 """Each node reads the samples around it by place, level and normal: a joint bilateral filter, linear in space."""
 
 import os
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from illumgrid.errors import BadInput
 from illumgrid.field.lattice import GridSpec
-from illumgrid.field.volume import world_to_index
+from illumgrid.field.volume import Floats, world_to_index
 from illumgrid.grid import IlluminationGrid, Nodes
-from illumgrid.grid.nodes import reachable
+from illumgrid.grid.nodes import reached
 from illumgrid.stages import Interpolator, hookimpl
 from illumgrid.transport.samples import Samples
 
-_BLOCK = 1 << 14
+_BLOCK = 1 << 14  # samples of which queries are held
+_SLAB, _CHUNK = 1 << 16, 1 << 12  # nodes that are read while the samples around them are held, and by one thread
 _ON_A_NODE = 1e-6  # of a spacing
 
 
-class Bins(NamedTuple):
-    """Samples of one field sorted by the node of the lit lattice that they are next to."""
+class Sorted(NamedTuple):
+    """Samples of some planes of the lit lattice, in the order of the nodes that they are next to."""
 
-    start: NDArray[np.int64]  # (rows + 1,) of each row of nodes along z
-    column: NDArray[np.int32]  # (m,) node in the row
+    near: NDArray[np.integer]  # (m,) flat numbers of those nodes
     place: NDArray[np.float32]  # (m, 8): see `illumgrid.grid.reading.estimate`
     light: NDArray[np.float32]  # (m, C)
     variance: NDArray[np.float32]  # (m,)
@@ -32,51 +33,56 @@ class Bins(NamedTuple):
     dark: NDArray[np.int64]  # flat numbers of the holes of the lit lattice, in order
 
 
-def bins(samples: Samples, nodes: Nodes) -> Bins:
-    """Sort samples into the nodes' lattice, some at a time; holes are left out, and marked."""
+def _next_to(spec: GridSpec, points: Floats) -> tuple[Floats, NDArray[np.int64]]:
+    """Index (n, 3) of world points in a lattice, and the nearest nodes."""
+    index = world_to_index(spec, points)
+    return index, np.clip(np.round(index), 0, np.array(spec.shape) - 1).astype(np.int64)
+
+
+def _planes(samples: Samples, spec: GridSpec) -> NDArray[np.integer]:
+    """The plane (n,), along the first axis, of the node that each sample is next to."""
+    plane = np.empty(len(samples), np.min_scalar_type(spec.shape[0]))  # one byte each, usually
+    for first in range(0, len(samples), _BLOCK):
+        some = slice(first, first + _BLOCK)
+        plane[some] = _next_to(spec, samples.queries[some].point)[1][:, 0]
+    return plane
+
+
+def _in_order(samples: Samples, rows: NDArray[np.integer], nodes: Nodes) -> Sorted:
+    """Sort some of the samples into the nodes' lattice; holes are left out, and marked."""
     from illumgrid.grid.reading import slopes
 
     spec, volume = nodes.spec, nodes.field.volume
-    rows, nz = spec.shape[0] * spec.shape[1], spec.shape[2]
+    lit = samples.paths[rows] > 0
+    index, closest = _next_to(spec, samples.queries[rows[~lit]].point)
+    on_a_node = (np.abs(index - closest) < _ON_A_NODE).all(axis=1)
+    dark = np.unique(np.ravel_multi_index(tuple(closest[on_a_node].T), spec.shape))
+    rows = rows[lit]
     scale, shift = _level_units(nodes)
-    count, channels = len(samples), samples.light.shape[1] if samples.channels.mixable else 0
-    flat, dark = np.empty(count, np.int32 if len(nodes) < 1 << 31 else np.int64), [np.zeros(0, np.int64)]
-    place, variance = np.empty((count, 8), np.float32), np.empty(count, np.float32)
-    each = np.empty((count, channels), np.float32)
-    for first in range(0, count, _BLOCK):
-        part = samples[first : first + _BLOCK]  # its queries are computed here, where only numbers of nodes are kept
-        queries, index = part.queries, world_to_index(spec, part.queries.point)
-        closest = np.clip(np.round(index), 0, np.array(spec.shape) - 1).astype(np.int64)
-        nearest = np.ravel_multi_index(tuple(closest.T), spec.shape)
-        lit = part.paths > 0
-        dark.append(nearest[~lit & (np.abs(index - closest) < _ON_A_NODE).all(axis=1)])
-        good = np.flatnonzero(lit)
-        slope, here = np.zeros(len(good)), first + good
-        slopes(volume.stored, volume.spacing, spec.spacing, world_to_index(volume, queries.point[good]), slope)
+    channels = samples.light.shape[1] if samples.channels.mixable else 0
+    near: NDArray[np.integer] = np.empty(len(rows), np.int32 if len(nodes) < 1 << 31 else np.int64)
+    ids = np.empty(len(rows), np.uint64)
+    place, variance = np.empty((len(rows), 8), np.float32), np.empty(len(rows), np.float32)
+    each = np.empty((len(rows), channels), np.float32)
+    for first in range(0, len(rows), _BLOCK):
+        here = slice(first, first + _BLOCK)
+        part = samples[rows[here]]  # its queries are computed here, where only numbers of nodes are kept
+        queries, (index, closest) = part.queries, _next_to(spec, part.queries.point)
+        near[here], ids[here] = np.ravel_multi_index(tuple(closest.T), spec.shape), queries.id
+        slope = np.zeros(len(part))
+        slopes(volume.stored, volume.spacing, spec.spacing, world_to_index(volume, queries.point), slope)
         place[here] = np.column_stack(
             [
-                index[good], (volume.to_stored(queries.level[good, nodes.number]) - shift) * scale,
-                queries.normal[good] @ volume.direction, slope * scale,
+                index, (volume.to_stored(queries.level[:, nodes.number]) - shift) * scale,
+                queries.normal @ volume.direction, slope * scale,
             ]
         )  # fmt: skip
-        flat[first : first + _BLOCK] = nearest
-        variance[here] = np.square(part.error[good], dtype=np.float64)
+        variance[here] = np.square(part.error, dtype=np.float64)
         if (errors := part.errors) is not None:
-            each[here] = np.square(errors[good])
-    good = np.flatnonzero(samples.paths > 0)
-    good = good[np.lexsort((samples.queries.id[good], flat[good]))]
-    start, near = np.zeros(rows + 1, np.int64), flat[good]
-    np.cumsum(np.bincount(near // nz, minlength=rows), out=start[1:])
-    light = np.ascontiguousarray(samples.light[good], np.float32)
-    place, variance, each = (_in_order(array, good) for array in (place, variance, each))
-    return Bins(start, (near % nz).astype(np.int32), place, light, variance, each, np.unique(np.concatenate(dark)))
-
-
-def _in_order(array: NDArray[np.float32], rows: NDArray[np.integer]) -> NDArray[np.float32]:
-    """Rows of an array in this order, sorted where they are, one column at a time."""
-    for column in np.atleast_2d(array.T):
-        column[: len(rows)] = column[rows]
-    return array[: len(rows)]
+            each[here] = np.square(errors)
+    order = np.lexsort((ids, near))
+    light = np.asarray(samples.light[rows[order]], np.float32)
+    return Sorted(near[order], place[order], light, variance[order], each[order], dark)
 
 
 def _level_units(nodes: Nodes) -> tuple[float, float]:
@@ -115,8 +121,28 @@ class Bilateral:
     def fill(self, samples: Samples, nodes: Nodes) -> IlluminationGrid:
         """Fill a grid of `density` times the nodes: see `illumgrid.stages.Interpolator`."""
         dense = Nodes(denser(nodes.spec, self.density), nodes.field, nodes.number)
-        flat = reachable(nodes.field, dense.spec)
-        return dense.grid_of(flat, list(read(samples, nodes, dense, flat)), samples.channels)
+        wanted = reached(nodes.field, dense.spec).reshape(-1)
+
+        def within(ends: slice) -> tuple[NDArray[np.intp], NDArray[np.integer]]:
+            flat = ends.start + np.flatnonzero(wanted[ends])
+            return flat, flat
+
+        found = _empty(len(dense), samples)
+        _read(samples, nodes, dense, within, found)
+        light, error, support, errors = found
+        return dense.grid(light, error, support, samples.channels, errors if errors.shape[1] else None)
+
+
+Found = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]
+"""Light (n, C), error (n,), support (n,); error of each channel, (n, C) where they are mixed later, else (n, 0)."""
+
+
+def _empty(count: int, samples: Samples) -> Found:
+    """Nodes that nothing is known of."""
+    channels = samples.light.shape[1]
+    each = np.full((count, channels if samples.channels.mixable else 0), np.inf, np.float32)
+    light, support = np.zeros((count, channels), np.float32), np.zeros(count, np.float32)
+    return light, np.full(count, np.inf, np.float32), support, each
 
 
 def read(
@@ -127,28 +153,90 @@ def read(
     The samples lie around `nodes`, the lattice that was lit. `errors` (n, C) are those of each channel where several
     layers are mixed later, else None.
     """
+
+    def within(ends: slice) -> tuple[NDArray[np.intp], NDArray[np.integer]]:
+        rows = np.flatnonzero((flat >= ends.start) & (flat < ends.stop))
+        return rows, flat[rows]
+
+    found = _empty(len(flat), samples)
+    _read(samples, nodes, dense, within, found)
+    light, error, support, errors = found
+    return light, error, support, errors if errors.shape[1] else None
+
+
+def _read(
+    samples: Samples, nodes: Nodes, dense: Nodes,
+    within: Callable[[slice], tuple[NDArray[np.intp], NDArray[np.integer]]], out: Found,
+) -> None:  # fmt: skip
+    """Read slab by slab; `within` says which nodes of `dense` to read among some, and in which rows of `out`.
+
+    Only the samples around a slab are held in order; those that the next one reads as well are kept.
+    """
+    from illumgrid.grid.reading import MOVED
+
+    spec, stored = nodes.spec, dense.spec.shape
+    none = np.zeros(0, np.intp)
+    plane, done = _planes(samples, spec), 0
+    around: list[NDArray[Any]] = [*_in_order(samples, none, nodes)]
+    ratio = (spec.shape[0] - 1) / (stored[0] - 1)
+    reach = 2.5 + MOVED * (spec.shape[0] - 1) / (nodes.field.volume.shape[0] - 1) + 1e-6
+    each = stored[1] * stored[2]
+    thick = max(1, _SLAB // each)
+    with ThreadPoolExecutor(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else None) as pool:
+        for first in range(0, stored[0], thick):
+            last = min(first + thick, stored[0]) - 1
+            rows, flat = within(slice(first * each, (last + 1) * each))
+            if not len(rows):
+                continue
+            low = max(0, int(np.ceil(first * ratio - reach)))
+            high = min(int(np.floor(last * ratio + reach)) + 1, spec.shape[0])
+            fresh = [  # a mask of all would take as much as their planes
+                k + np.flatnonzero((plane[k : k + _BLOCK] >= max(done, low)) & (plane[k : k + _BLOCK] < high))
+                for k in range(0, len(plane), _BLOCK)
+            ]
+            some = _in_order(samples, np.concatenate([none, *fresh]), nodes)
+            _go_on(around, some, low * spec.shape[1] * spec.shape[2])
+            done = high
+            for whole, here in zip(out, _read_slab(Sorted(*around), nodes, dense, flat, pool)):
+                whole[rows] = here
+
+
+def _go_on(around: list[NDArray[Any]], fresh: Sorted, flat: int) -> None:
+    """Leave out the samples next to nodes before this number, and add those of later planes, an array at a time."""
+    first, first_dark = np.searchsorted(around[0], flat), np.searchsorted(around[-1], flat)
+    for k, array in enumerate(fresh):
+        around[k] = np.concatenate([around[k][first_dark if k == len(fresh) - 1 else first :], array])
+
+
+def _read_slab(
+    around: Sorted, nodes: Nodes, dense: Nodes, flat: NDArray[np.integer], pool: ThreadPoolExecutor
+) -> Found:
+    """What is found at some nodes of `dense` among the samples around them."""
     from illumgrid.grid.reading import fill
 
-    sorted_ = bins(samples, nodes)
+    near, place, light, variance, each, dark = around
     spec, field = nodes.spec, nodes.field
-    light = np.zeros((len(flat), samples.light.shape[1]), np.float32)
-    error, support = np.full(len(flat), np.inf, np.float32), np.zeros(len(flat), np.float32)
-    errors = np.full((len(flat), sorted_.each.shape[1]), np.inf, np.float32)
+    start = np.zeros(spec.shape[0] * spec.shape[1] + 1, np.int64)
+    np.cumsum(np.bincount(near // spec.shape[2], minlength=len(start) - 1), out=start[1:])
+    column = (near % spec.shape[2]).astype(np.int32)
     volume, (scale, shift) = field.volume, _level_units(nodes)
     ratio = (np.array(spec.shape) - 1.0) / (np.array(volume.shape) - 1.0)
+    out = np.zeros((len(flat), light.shape[1]), np.float32)
+    error, support = np.full(len(flat), np.inf, np.float32), np.zeros(len(flat), np.float32)
+    errors = np.full((len(flat), each.shape[1]), np.inf, np.float32)
 
     def chunk(some: slice) -> None:
         index = np.unravel_index(flat[some], dense.spec.shape)
         fill(
-            volume.stored, volume.spacing, field.upward, field.stored_range, scale, shift, *sorted_,
+            volume.stored, volume.spacing, field.upward, field.stored_range, scale, shift,
+            start, column, place, light, variance, each, dark,
             np.array(spec.shape), ratio, np.stack(index, axis=1) * (dense.spec.spacing / volume.spacing),
-            light[some], error[some], errors[some], support[some],
+            out[some], error[some], errors[some], support[some],
         )  # fmt: skip
 
     chunk(slice(0, 0))  # compiles once, in the main thread, which Ctrl-C interrupts
-    with ThreadPoolExecutor(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else None) as pool:
-        list(pool.map(chunk, (slice(i, i + _BLOCK) for i in range(0, len(flat), _BLOCK))))
-    return light, error, support, errors if errors.shape[1] else None
+    list(pool.map(chunk, (slice(i, i + _CHUNK) for i in range(0, len(flat), _CHUNK))))
+    return out, error, support, errors
 
 
 def denser(spec: GridSpec, density: float) -> GridSpec:

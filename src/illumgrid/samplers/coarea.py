@@ -1,5 +1,7 @@
 """Points that are uniform by area on level sets, each on one of its own: no surface is extracted."""
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -8,6 +10,7 @@ from illumgrid.field.volume import AT_ONCE, Floats, cell_gradient, index_to_worl
 from illumgrid.transport.samples import Queries, join_queries
 
 _LOOKED_AT = 1 << 24  # voxels of a field of which all are looked at
+_AT_ONCE = 1 << 20  # cells of which the chances are held
 _STEPS = 64  # of the isovalue, within which points are uniform by area
 
 
@@ -20,17 +23,17 @@ def points_on_level_sets(scene: Scene, points: int, seed: tuple[int, ...]) -> Qu
     found = []
     for number, field in enumerate(scene.fields):
         random = np.random.default_rng((*seed, number))
-        cells, chance = _cells_by_step(field, random)
-        if not len(cells):
+        cells = _cells_by_step(field, random)
+        if not len(cells.number):
             continue
-        upto = np.cumsum(chance)
-        tried = np.searchsorted(upto, random.random(max(1 << 15, 64 * points)) * upto[-1]).clip(0, len(cells) - 1)
+        tried = cells.drawn(random.random(max(1 << 15, 64 * points)))
+        chance = cells.chance(tried)
         shape = tuple(n - 1 for n in field.volume.shape)
-        index = np.stack(np.unravel_index(cells[tried], shape), axis=1) + random.random((len(tried), 3))
+        index = np.stack(np.unravel_index(cells.number[tried], shape), axis=1) + random.random((len(tried), 3))
         share = field.place(interpolate(field.volume, index))
         kept = (share >= 0) & (share <= 1)
         index, step = index[kept], np.minimum(share[kept] * _STEPS, _STEPS - 1).astype(int)
-        weight = np.linalg.norm(cell_gradient(field.volume, index), axis=1) / chance[tried[kept]]
+        weight = np.linalg.norm(cell_gradient(field.volume, index), axis=1) / chance[kept]
         total = np.bincount(step, weight, minlength=_STEPS)
         weight = weight / np.where(total > 0, total, 1.0)[step]
         if weight.any():
@@ -46,12 +49,45 @@ def points_on_level_sets(scene: Scene, points: int, seed: tuple[int, ...]) -> Qu
     return asked[np.flatnonzero(asked.normal.any(axis=1))]
 
 
-def _cells_by_step(field: Field, random: np.random.Generator) -> tuple[NDArray[np.int64], Floats]:
-    """Flat numbers (n,) of the voxel cells that the range crosses, and chances (n,) that give every step as many.
+@dataclass(frozen=True, eq=False)
+class _Cells:
+    """Voxel cells that the range crosses, and chances that give every step of the isovalue as many.
 
-    Chosen all alike, the few cells around a small level set would hardly be met. Of a volume of more than `_LOOKED_AT`
-    voxels only some columns of cells are looked at.
+    Chosen all alike, the few cells around a small level set would hardly be met.
     """
+
+    number: NDArray[np.integer]  # (n,) flat
+    first: NDArray[np.int8]  # (n,) step of the range that the cell crosses first
+    last: NDArray[np.int8]  # (n,) one behind the last
+    rare: Floats  # (steps + 1,) sum over the steps before of one part in so many cells that cross them
+
+    def chance(self, some: slice | NDArray[np.integer]) -> Floats:
+        """Chances of some cells."""
+        return np.asarray(self.rare[self.last[some]] - self.rare[self.first[some]])
+
+    def drawn(self, shares: Floats) -> NDArray[np.int64]:
+        """The cell at each share (m,) of the sum of all chances, which is never held as a whole."""
+        ends, total = [], 0.0
+        begins = range(0, len(self.number), _AT_ONCE)
+        for begin in begins:
+            total = float(self._upto(begin, total)[-1])
+            ends.append(total)
+        wanted, found = shares * total, np.empty(len(shares), np.int64)
+        part = np.searchsorted(ends, wanted).clip(0, len(ends) - 1)
+        for k, begin in enumerate(begins):
+            here = np.flatnonzero(part == k)
+            found[here] = begin + np.searchsorted(self._upto(begin, ends[k - 1] if k else 0.0), wanted[here])
+        return found.clip(0, len(self.number) - 1)
+
+    def _upto(self, begin: int, before: float) -> Floats:
+        """Sums of the chances up to each of some cells; `before` is that of the cells in front of them."""
+        chance = self.chance(slice(begin, begin + _AT_ONCE))
+        chance[0] += before
+        return np.cumsum(chance, out=chance)
+
+
+def _cells_by_step(field: Field, random: np.random.Generator) -> _Cells:
+    """The cells that the range crosses; in a volume of more than `_LOOKED_AT` voxels, those of some columns."""
     nx, ny, nz = field.volume.shape
     many, at_once = (nx - 1) * (ny - 1), max(1, AT_ONCE // (4 * nz))
     columns = np.arange(many)
@@ -64,17 +100,13 @@ def _cells_by_step(field: Field, random: np.random.Generator) -> tuple[NDArray[n
     rare = np.concatenate([[0.0], np.cumsum(1.0 / np.maximum(np.cumsum(many_in), 1))])
     each = [list(of) for of in zip(*parts)]
     del parts  # there are as many cells as voxels that are looked at: their parts go as they are joined
-    cells, first, last = (np.concatenate(each.pop(0)) for _ in range(3))
-    chance = rare[last]
-    for begin in range(0, len(chance), AT_ONCE):
-        some = slice(begin, begin + AT_ONCE)
-        chance[some] -= rare[first[some]]
-    return cells, chance
+    number, begin, end = (np.concatenate(each.pop(0)) for _ in range(3))
+    return _Cells(number, begin, end, rare)
 
 
 def _crossed(
     field: Field, columns: NDArray[np.int64]
-) -> tuple[NDArray[np.int64], NDArray[np.int16], NDArray[np.int16]]:
+) -> tuple[NDArray[np.integer], NDArray[np.int8], NDArray[np.int8]]:
     """Of the cells in some columns along the last axis, those that the range crosses: number, first step, last + 1."""
     (lowest, highest), (_, ny, nz) = map(float, field.stored_range), field.volume.shape
     x, y = np.divmod(columns, ny - 1)
@@ -87,4 +119,6 @@ def _crossed(
     first = np.maximum(np.minimum(low[:, :-1], low[:, 1:]), 0)
     last = np.minimum(np.maximum(high[:, :-1], high[:, 1:]), _STEPS - 1)
     row, z = np.nonzero(first <= last)
-    return columns[row] * (nz - 1) + z, first[row, z].astype(np.int16), last[row, z].astype(np.int16) + np.int16(1)
+    number = columns[row] * (nz - 1) + z
+    small = np.int32 if field.volume.stored.size < 1 << 31 else np.int64
+    return number.astype(small), first[row, z], last[row, z] + np.int8(1)

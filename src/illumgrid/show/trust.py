@@ -59,7 +59,7 @@ def doubts(light: Illumination) -> list[str]:
     rough = [name for name, grid in zip(names, light.grids) if grid.resolution < RESOLVED]
     if rough:
         found.append(f"lower bounds only: the grid does not resolve the light of {', '.join(rough)}")
-    silent = [name for name, g in zip(names, light.grids) if not np.isfinite(g.error[g.support > 0]).all()]
+    silent = [name for name, g in zip(names, light.grids) if not np.isfinite(g.held.error[g.held.support > 0]).all()]
     if silent:
         found.append(f"too few paths to estimate the error of {', '.join(silent)}, which is hatched like a hole")
     return found

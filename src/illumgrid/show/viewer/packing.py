@@ -97,7 +97,7 @@ def _field(
 ) -> dict[str, Any]:
     field, whole, sky = light.scene.fields[number], light.grids[number], skies.sky_of(light)
     room = skies.room(light) if sky else np.inf
-    most = min(MOST_NODES, int(min(1.0, room / (skies.FEWEST + skies.FINE)) * whole.support.size))
+    most = min(MOST_NODES, int(min(1.0, room / (skies.FEWEST + skies.FINE)) * math.prod(whole.spec.shape)))
     volume, grid = reduced(field.volume, MOST_VOXELS), thinned(whole, most)
     sign = field.upward
     swept = field.stored_range if field.isovalue is None else np.array(field.volume.stored_extremes, float)
@@ -128,7 +128,7 @@ def _field(
         lit = np.zeros(grid.spec.shape, bool)
         lit.flat[reachable(field, grid.spec)] = True
         held = skies.answers(light, sky, (grid.light.transpose(2, 1, 0, 3) * scale)[lit.T], grid.channels)
-        kept = skies.fitting(room * whole.support.size / grid.support.size, sky)
+        kept = skies.fitting(room * math.prod(whole.spec.shape) / grid.support.size, sky)
         shown["mask"] = into.add(np.packbits(lit.T.ravel(), bitorder="little").tobytes())
         shown["sky"], lost = skies.pack_sky(held, kept, into)
         _note_lost(notes, field.name, kept, len(sky.coefficients), lost)
