@@ -26,12 +26,18 @@ CHROMIUM = next((p for p in ("/usr/bin/chromium", "/usr/bin/chromium-browser") i
 ARGS = [
     "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-quic", "--no-first-run",
     "--disable-background-networking", "--disable-component-update", "--disable-sync",
+    "--disable-angle-features=warmUpPipelineCacheAtLink",  # what draws is compiled when it first draws
 ]  # fmt: skip
 WIDTH, HEIGHT = 120, 90
-SMALL = (
-    "addEventListener('DOMContentLoaded', () => document.head.insertAdjacentHTML('beforeend', '<style>"
-    f".viewer {{ display: block !important }} .stage {{ width: {WIDTH}px; height: {HEIGHT}px }}</style>'))"
-)
+QUICK = """const now = performance.now.bind(performance);
+performance.now = () => 100 * now();"""
+"""Full frames come at once, and the page takes them for slow: they have four samples, as still pictures."""
+SMALL = """addEventListener('DOMContentLoaded', () => {
+    const [, width, height] = location.search.match(/(\\d+)x(\\d+)/) ?? [0, WIDTH, HEIGHT];
+    document.head.insertAdjacentHTML('beforeend', `<style>.viewer { display: block !important }
+        .stage { width: ${width}px; height: ${height}px }</style>`);
+})""".replace("WIDTH, HEIGHT", f"{WIDTH}, {HEIGHT}")
+"""A picture of this size, or of that which the address asks for: graphics are drawn by the processor here."""
 
 
 def waves(*shape):
@@ -121,6 +127,14 @@ TO = """(address) => new Promise((done) => {
 })"""
 
 
+REST = """(size) => {
+    const { resting, put } = illumgrid, begin = resting.begin.bind(resting);
+    resting.begin = (state, width, height) => begin(state, width, height, 0);  // whole frames, whatever the clock says
+    if (size !== true) resting.trial = resting.targets(...size);
+    put({ rest: true });
+}"""
+
+
 def until(page, condition):
     """Wait for a condition; Playwright's own way evaluates text, which the page's policy forbids."""
     end = time.monotonic() + 120
@@ -140,16 +154,17 @@ class Browser:
         self.context.add_init_script(SMALL)
         self.folder, self.requests, self.troubles, self.shown = folder, [], [], None
         self.page = self.context.new_page()
+        self.page.add_init_script(QUICK)
         self.page.on("request", lambda request: self.requests.append(request.url))
         self.page.on("pageerror", lambda error: self.troubles.append(str(error)))
         self.page.on("console", lambda said: self.troubles.append(said.text) if said.type == "error" else None)
 
-    def open(self, light, address="", anew=False, rest=False, tint=None):
+    def open(self, light, address="", anew=False, rest=False, tint=None, size=(WIDTH, HEIGHT)):
         """Show a light at an address; a page that shows this light already only gets the address. Pictures of lookups
-        are compared while no rays refine them.
+        are compared while no rays refine them; with `rest`, they do, judged in a trial of this size in pixels, or of
+        the page's own size.
         """
-        if not rest:
-            address = f"{address}&rest=0" if address else "rest=0"
+        address = f"{address}&rest=0" if address else "rest=0"
         if self.shown is light and not anew:
             self.page.evaluate(TO, address)
             return self.settle()
@@ -158,15 +173,27 @@ class Browser:
         if not file.exists():
             file.write_text(page(light, tint=tint), encoding="utf-8")
         self.page.goto("about:blank")
-        self.page.goto(f"{file.as_uri()}#{address}")
-        return self.settle()
+        self.page.goto("{}?{}x{}#{}".format(file.as_uri(), *size, address))
+        self.settle()
+        if rest:
+            self.page.evaluate(REST, rest)
+            self.settle()
+        return self.page
 
     def settle(self):
         return until(self.page, "document.querySelector('canvas').getAttribute('aria-busy') === 'false'")
 
+    def at_rest(self, rays):
+        """Pixels once so many rays have left every pixel; no further ones leave."""
+        until(self.page, f"illumgrid.resting.rays >= {rays} || illumgrid.resting.done")
+        return self.drawn("illumgrid.resting.enough = 0, illumgrid.resting.show(illumgrid.state.stops)")
+
     def pixels(self):
         self.settle()
-        script = "(illumgrid.picture.show(), document.querySelector('canvas').toDataURL())"
+        return self.drawn("illumgrid.picture.show()")
+
+    def drawn(self, how):
+        script = f"({how}, document.querySelector('canvas').toDataURL())"
         return decoded(base64.b64decode(self.page.evaluate(script).split(",")[1]))
 
 
@@ -174,12 +201,12 @@ def decoded(file):
     return np.asarray(Image.open(io.BytesIO(file)).convert("RGB")).astype(int)
 
 
-def still(light, t, **options):
+def still(light, t, size=(WIDTH, HEIGHT), **options):
     """The software picture at a position of the sweep, the page's address for the same view, and the object's mask."""
     scene = light.scene
     row = scene.levels(t)[0]
-    camera = fit_camera(scene, row, WIDTH / HEIGHT)
-    options |= {"width": WIDTH, "height": HEIGHT, "camera": camera}
+    camera = fit_camera(scene, row, size[0] / size[1])
+    options |= {"width": size[0], "height": size[1], "camera": camera}
     made = preview.render(light, isovalue=row[0], **options).astype(int)
     address = f"isovalue={float(row[0])!r}&view={camera_state(scene, camera)}"
     return made, address, (made != made[0, 0]).any(axis=2)

@@ -242,6 +242,7 @@ def test_where_a_ray_touches_a_saddle_there_is_no_normal():
     assert not normal.any() or abs(normal[0] @ along) > 0.99  # or it is that of a rounding beside it
 
 
+@pytest.mark.skipif(not numba.config.DISABLE_JIT, reason="one path alone would be compiled")
 def test_a_path_that_starts_inside_another_solid_is_worth_nothing():
     scene = colored(furnace(linear((1, 0, 0)), linear((1, 0, 0), origin=(0.1, 0.1, 0.1))))
     levels = turned_levels(scene, np.array([2.5, 2.5]))  # the second, below, holds all from 0.1 to 2.6 along x

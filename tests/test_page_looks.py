@@ -1,6 +1,5 @@
 """Films, coats, cuts and a second quantity in the page: its pixels are those of the still pictures."""
 
-import base64
 from dataclasses import replace
 
 import numpy as np
@@ -8,7 +7,7 @@ import pytest
 from scipy.ndimage import binary_erosion
 
 import illumgrid as ig
-from browser import browser, coloured, decoded, still, until  # noqa: F401
+from browser import browser, coloured, still  # noqa: F401
 from illumgrid.field.scene import Material
 from illumgrid.show.exact import Exact
 from illumgrid.show.tints import Tint
@@ -18,6 +17,7 @@ from illumgrid.tone import decode_srgb
 from shapes import ball, sampled, sky
 
 pytestmark = pytest.mark.filterwarnings("default")  # of the browser's driver
+SIZE = (72, 54)
 
 
 def named(name, **material):
@@ -70,13 +70,11 @@ def test_a_second_quantity_colours_the_page_as_the_picture(browser):  # noqa: F8
 def test_coats_at_rest_become_those_of_exact_pictures(browser):  # noqa: F811
     scene = ig.Scene.studio(ball(20), range=(0.3, 0.9), albedo=(0.2, 0.2, 0.2))
     light = ig.run(scene, grid=10, paths=32, bounces=2, seed=0, judge=False).looking(roughness=0.4)
-    wanted, address, covered = still(light, 0.5, exact=Exact(64))
-    browser.open(light, address, rest=True)
+    wanted, address, covered = still(light, 0.5, SIZE, exact=Exact(64))
+    browser.open(light, address, rest=(48, 36), size=SIZE)
     inner = binary_erosion(covered, iterations=2)
-    cheap = browser.pixels()
-    until(browser.page, "illumgrid.resting.rays >= 32 || illumgrid.resting.done")
-    script = "(illumgrid.resting.show(illumgrid.state.stops), document.querySelector('canvas').toDataURL())"
-    rested = decoded(base64.b64decode(browser.page.evaluate(script).split(",")[1]))
+    assert inner.sum() > 500
+    cheap, rested = browser.pixels(), browser.at_rest(32)
     truth, before, now = (decode_srgb(x[inner].astype(np.uint8)) for x in (wanted, cheap, rested))
     # The cheap look is worth 8 rays: 8 / 40 of its difference is left, and the noise of 32 rays.
     assert np.sqrt(np.square(now - truth).mean()) < 0.4 * np.sqrt(np.square(before - truth).mean())

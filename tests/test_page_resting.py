@@ -1,6 +1,5 @@
 """The page at rest: rays from every pixel make it the exact picture, and start from that of the lookup."""
 
-import base64
 from dataclasses import replace
 
 import numpy as np
@@ -8,7 +7,7 @@ import pytest
 from scipy.ndimage import binary_erosion
 
 import illumgrid as ig
-from browser import bent, browser, coloured, decoded, pair, still, until  # noqa: F401
+from browser import bent, browser, coloured, pair, still, until  # noqa: F401
 from illumgrid.field.lights import Sky
 from illumgrid.field.scene import Material
 from illumgrid.show.exact import Exact
@@ -18,7 +17,7 @@ from illumgrid.show.viewer.resting import smaller
 from illumgrid.tone import decode_srgb
 
 pytestmark = pytest.mark.filterwarnings("default")  # of the browser's driver
-RAYS = 8
+RAYS, TRIAL = 8, (48, 36)
 
 
 def balls():
@@ -27,13 +26,6 @@ def balls():
     middles, sizes = np.random.default_rng(0).uniform(-0.5, 0.5, (6, 3)), (0.05, 0.2, 0.1, 0.15, 0.07, 0.18)
     height = sum(np.exp(-((place - m) ** 2).sum(axis=-1) / s) for m, s in zip(middles, sizes))
     return ig.Volume((height / height.max()).astype(np.float32))
-
-
-def at_rest(browser, rays):  # noqa: F811
-    """Pixels once so many rays have left every pixel."""
-    until(browser.page, f"illumgrid.resting.rays >= {rays} || illumgrid.resting.done")
-    script = "(illumgrid.resting.show(illumgrid.state.stops), document.querySelector('canvas').toDataURL())"
-    return decoded(base64.b64decode(browser.page.evaluate(script).split(",")[1]))
 
 
 def pictured():
@@ -60,19 +52,20 @@ def tint():
 
 @pytest.mark.parametrize("kind", ["studio", "box", "image", "tinted"])
 def test_rays_take_away_what_the_lookup_is_off(browser, kind):  # noqa: F811
-    light = ig.run(scene_of(kind), grid=10, paths=64, seed=0, judge=False)
+    light = ig.run(scene_of(kind), grid=10, paths=64, isovalues=3, seed=0, judge=False)
     second = tint() if kind == "tinted" else None
-    looked_up, address, covered = still(light, 0.5, tint=second)
-    wanted, _, _ = still(light, 0.5, exact=Exact(64), tint=second)
+    size = (120, 90) if kind == "box" else (96, 72)  # a pixel beside the lamp would outweigh all others
+    looked_up, address, covered = still(light, 0.5, size, tint=second)
+    wanted, _, _ = still(light, 0.5, size, exact=Exact(64), tint=second)
     for page in browser.folder.glob("*.html"):  # of the scene before, whose field has the same name
         page.unlink()
-    browser.open(light, address, rest=True, tint=second)
+    browser.open(light, address, rest=TRIAL, tint=second, size=size)
     assert not browser.troubles
     if second:
-        covered = still(light, 0.5)[2]
-        covered[:30] = False  # the legend
+        covered = still(light, 0.5, size)[2]
+        covered[: size[1] // 3] = False  # the legend
     inner = binary_erosion(covered, iterations=2)  # outlines are sampled at other places
-    before, now, truth = (decode_srgb(x[inner].astype(np.uint8)) for x in (looked_up, at_rest(browser, RAYS), wanted))
+    before, now, truth = (decode_srgb(x[inner].astype(np.uint8)) for x in (looked_up, browser.at_rest(RAYS), wanted))
     off = np.sqrt(np.square(now - truth).mean()), np.sqrt(np.square(before - truth).mean())
     # By theory sqrt(N0 / (N0 + N)) is left: 0.58 where a lookup is worth the fewest rays, 4, and more on walls.
     assert off[0] < (0.8 if kind == "box" else 0.58) * off[1]
@@ -92,8 +85,8 @@ def test_images_of_the_sky_keep_their_light_in_few_pixels():
 
 
 def test_only_what_changes_the_light_starts_the_rays_again(browser):  # noqa: F811
-    page = browser.open(coloured(pair()), rest=True)
-    at_rest(browser, 3)
+    page = browser.open(coloured(pair()), rest=(16, 12), size=(32, 24))
+    until(page, "illumgrid.resting.rays >= 3")
     page.evaluate("illumgrid.put({ stops: 0.5 })")
     browser.settle()
     assert page.evaluate("illumgrid.resting.rays") >= 3
@@ -111,7 +104,7 @@ def test_pages_that_cannot_gather_have_no_switch_for_it(browser):  # noqa: F811
     shining = replace(bent(), fields=(replace(field, name="shining", material=Material((0.5,) * 3, (1.0, 0, 0))),))
     light = coloured(shining)
     assert packed(light)[0]["resting"] is None
-    assert not browser.open(light, rest=True).locator('[data-part="refine"]').is_visible()
+    assert not browser.open(light).locator('[data-part="refine"]').is_visible()
 
 
 def test_lights_that_rays_ask_for_carry_their_exposure_and_weights():
