@@ -29,21 +29,20 @@ def _crossed_cells(field: Field, rows: slice) -> NDArray[np.bool_]:
     return _any_corner(values >= low) & _any_corner(values <= high)
 
 
-def _overlapped(cells: int, grid_cells: int) -> list[slice]:
-    """The voxel cells along an axis that each grid cell overlaps."""
-    first = np.arange(grid_cells) * cells // grid_cells
-    last = -(-(np.arange(grid_cells) + 1) * cells // grid_cells)
-    return [slice(int(a), int(b)) for a, b in zip(first, last)]
+def _overlapped(cells: int, grid_cells: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """The first and the last voxel cell along an axis that each grid cell overlaps."""
+    numbers = np.arange(grid_cells)
+    return numbers * cells // grid_cells, -(-(numbers + 1) * cells // grid_cells) - 1
 
 
-def _any_overlapped(cells: NDArray[np.bool_], parts: list[slice], axis: int) -> NDArray[np.bool_]:
-    """Whether any of the cells of each part is marked, along an axis."""
-    if len(parts) == cells.shape[axis]:
-        return cells
-    ends = [end for part in parts for end in (part.start, part.stop)]
-    beyond = np.zeros_like(cells.take([0], axis))  # the end of the last part must be a place as well
-    whole = np.logical_or.reduceat(np.concatenate([cells, beyond], axis), ends, axis)
-    return np.asarray(whole.take(np.arange(0, len(ends), 2), axis))
+def _any_between(
+    cells: NDArray[np.bool_], first: NDArray[np.int64], last: NDArray[np.int64], axis: int
+) -> NDArray[np.bool_]:
+    """Whether any cell from each `first` to each `last` is marked, along an axis."""
+    found = cells.take(first, axis)
+    for more in range(1, int((last - first).max()) + 1):
+        found |= cells.take(np.minimum(first + more, last), axis)
+    return np.asarray(found)
 
 
 def reachable(field: Field, spec: GridSpec) -> NDArray[np.int64]:
@@ -56,13 +55,16 @@ def reached(field: Field, spec: GridSpec) -> NDArray[np.bool_]:
 
     These are the corners of all grid cells that overlap a voxel cell crossed by a level set of the range.
     """
-    along = [_overlapped(n - 1, m - 1) for n, m in zip(field.volume.shape, spec.shape)]
-    crossed = np.zeros([len(parts) for parts in along], bool)
-    for row, cells in enumerate(along[0]):
-        layer = np.zeros([n - 1 for n in field.volume.shape[1:]], bool)
-        for part in slabs((cells.stop - cells.start, *field.volume.shape[1:])):  # layers of a coarse grid are thick
-            layer |= _crossed_cells(field, slice(cells.start + part.start, cells.start + part.stop)).any(axis=0)
-        crossed[row] = _any_overlapped(_any_overlapped(layer, along[1], 0), along[2], 1)
+    (first, last), *across = (_overlapped(n - 1, m - 1) for n, m in zip(field.volume.shape, spec.shape))
+    crossed = np.zeros([n - 1 for n in spec.shape], bool)
+    wide = (max(n, m) for n, m in zip(field.volume.shape[1:], spec.shape[1:]))
+    for part in slabs((field.volume.shape[0] - 1, *wide)):
+        cells = _crossed_cells(field, part)
+        for axis, (low, high) in enumerate(across, 1):
+            cells = _any_between(cells, low, high, axis)
+        rows = slice(int(np.searchsorted(last, part.start)), int(np.searchsorted(first, part.stop)))
+        low, high = np.maximum(first[rows], part.start), np.minimum(last[rows], part.stop - 1)
+        crossed[rows] |= _any_between(cells, low - part.start, high - part.start, 0)
     nodes = np.zeros(spec.shape, bool)
     for corner in np.ndindex(2, 2, 2):
         nodes[tuple(slice(c, c + n) for c, n in zip(corner, crossed.shape))] |= crossed
