@@ -16,7 +16,7 @@ from illumgrid.accuracy.probe import Probe
 from illumgrid.accuracy.reference import look_up
 from illumgrid.backends.numba_ import Numba
 from illumgrid.bake.accumulator import Bake
-from illumgrid.bake.refined import MOST, Chosen, chosen, paths_for, read_choice, written
+from illumgrid.bake.refined import MOST, PATHS, SHARED, Chosen, Seen, chosen, read_choice, written
 from illumgrid.field.volume import interpolate, world_to_index
 from illumgrid.grid import GridSpec, IlluminationGrid, Nodes
 from illumgrid.grid.nested import coarser, finer, spread, within
@@ -85,7 +85,42 @@ def test_a_body_without_hollows_is_lit_at_the_coarse_nodes_alone():
     choice = chosen(scene, base, 2, prepare(Numba(), scene), bounces=4, seed=1)
     assert choice.levels == 0
     np.testing.assert_array_equal(choice.flat[0], reachable(scene.fields[0], base[0]))
-    assert paths_for(choice, base) == 64
+    assert choice.paths == 64
+
+
+def looked_at(light, noise, seed=0):
+    """What two looks say of light (n, n, n), each with noise of its own."""
+    random = np.random.default_rng(seed)
+    return Seen.of(*(light + noise * random.standard_normal(light.shape) for _ in range(2)))
+
+
+def test_noise_and_what_lies_between_nodes_are_told_apart():
+    x = np.linspace(-1, 1, 41)[:, None, None] + np.zeros((41, 41, 41))
+    straight = looked_at(1 + 0.3 * x, 0.1)
+    assert straight.noise == pytest.approx(SHARED * 2 * 0.1**2, rel=0.05) and straight.between < 1e-4
+    stepped = looked_at(1 + 0.5 * (x > 0.01), 0.02)
+    mean = 1.25
+    # Linear interpolation of a jump by 0.5 is off by 0.5² / 6 in the mean square over one of 40 cells.
+    assert stepped.between == pytest.approx(0.25 / 6 / 40 / mean**2, rel=0.1) and stepped.falls == pytest.approx(2, 0.1)
+    bent = looked_at(1 + 0.2 * np.sin(6 * x), 0.0)
+    assert bent.falls > 12
+
+
+def test_the_more_noise_for_what_is_between_nodes_the_more_paths():
+    counts = [Seen(noise, 1e-4, 2.0).paths([1000]) for noise in (1e-6, 1e-3, 3e-3, 1e-1)]
+    assert counts == sorted(counts) and counts[0] == PATHS[0] and counts[-1] == PATHS[-1] and len(set(counts)) > 2
+    assert Seen(1e-1, 1e-4, 2.0).paths([1000, 3000]) == 16  # no more in all than the most from coarse nodes
+
+
+def test_light_that_is_smooth_but_noisy_is_lit_at_few_nodes_by_many_paths():
+    def labyrinth(x):
+        x = 3.5 * x
+        return np.sum(np.sin(x) * np.cos(np.roll(x, -1, axis=1)), axis=1)
+
+    scene = sky(sampled(labyrinth, (24, 24, 24), (-1, -1, -1), np.full(3, 2 / 23)), (-0.4, 0.4))
+    base = [GridSpec.over(scene.fields[0].volume, 20)]
+    choice = chosen(scene, base, 2, prepare(Numba(), scene), bounces=8, seed=1)
+    assert choice.levels == 0 and choice.paths == 64
 
 
 def test_finer_nodes_are_those_around_jumps_of_the_light(hollow):
@@ -159,8 +194,8 @@ def test_all_nodes_lit_are_read_as_by_the_bilateral_filter():
 def test_a_run_refines_by_default_and_gives_the_same_bits_on_any_threads():
     scene = sky(shell(), (0.2, 0.8))
     one, other = (ig.run(scene, backend=Numba(threads=n), isovalues=2, judge=False, seed=4) for n in (1, 3))
-    assert one.recipe["refined"] == {"from": 14, "levels": 1} and one.recipe["cache"]
-    assert one.recipe["grid"] == 27 and one.recipe["interpolator"] == {"name": "nested", "levels": 1}
+    assert one.recipe["refined"] == {"from": 14, "levels": 2} and one.recipe["cache"]
+    assert one.recipe["grid"] == 53 and one.recipe["interpolator"] == {"name": "nested", "levels": 2}
     for name in ("light", "error", "support"):
         np.testing.assert_array_equal(getattr(one.grids[0], name), getattr(other.grids[0], name))
 
@@ -186,19 +221,19 @@ def test_a_refined_run_that_was_stopped_can_be_seen_and_goes_on_to_the_same_bits
     monkeypatch.setattr(partial, "CHUNK", 64)
     monkeypatch.setattr(sys.modules["illumgrid.cli.outcome"], "judged_light", lambda light, stages, folder: light)
     np.save(tmp_path / "shell.npy", shell().values)
-    given = ("run", "shell.npy", "--scene", "sky", "--range", "0.2", "0.8", "--paths", "2", "--isovalues", "2",
+    given = ("run", "shell.npy", "--scene", "sky", "--range", "0.2", "0.8", "--paths", "3", "--isovalues", "2",
              "--no-preview")  # fmt: skip
     if planned:  # the first look has another number of nodes
         scene = ig.Scene.sky(ig.read_volume(tmp_path / "shell.npy"), range=(0.2, 0.8))
         ahead = looked(scene, prepare(Numba(), scene), 11, None, 0)
-        plan = choose.Plan(11, 2, None, 0.1, 1.0, 0.0, True, (), looked=True)
+        plan = choose.Plan(11, 3, None, 0.1, 1.0, 0.0, True, (), looked=True)
         monkeypatch.setattr("illumgrid.chain.planned", lambda *_, **how: (plan, ahead))
         given += ("--error", "0.1")
     call(*given, "-o", "whole")
     real, walked = walk.answer, itertools.count()
 
     def stopped(tracer, bounces, seed, work):
-        if len(work[1]) == 2 and next(walked) == 3:  # the first look has four paths
+        if len(work[1]) == 3 and next(walked) == 3:  # the first look has two paths
             raise KeyboardInterrupt
         return real(tracer, bounces, seed, work)
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from illumgrid.bake.known import light_known_first
-from illumgrid.bake.refined import ROUGH, Chosen, chosen, paths_for, written
+from illumgrid.bake.refined import ROUGH, Chosen, chosen, written
 from illumgrid.constants import PATHS
 from illumgrid.field.diagnosis import noisy
 from illumgrid.field.layers import layers_of
@@ -50,7 +50,7 @@ def light_ahead(
         ending = ending_in(cache_of(scene, nodes.looked, (), ROUGH), tracer)  # what is lit more finely ends none
     return Ahead(
         [finer(spec, nodes.levels) for spec in specs], Chosen(nodes.flat), ending, Nested(nodes.levels),
-        cached or in_look, written(nodes, specs), paths_for(nodes, specs), bounces, "look",
+        cached or in_look, written(nodes, specs), nodes.paths, bounces, "look",
     )  # fmt: skip
 
 

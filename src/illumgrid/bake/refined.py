@@ -2,7 +2,7 @@
 
 import base64
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -13,11 +13,11 @@ from illumgrid.bake.accumulator import Bake, Map, Progress
 from illumgrid.field.scene import Scene
 from illumgrid.grid import GridSpec, IlluminationGrid, Nodes
 from illumgrid.grid.nested import all_corners, finer, spread, within
-from illumgrid.grid.nodes import reachable
+from illumgrid.grid.nodes import reachable, reached
 from illumgrid.interpolators.bilateral import read
 from illumgrid.rng import shifted_seed
 from illumgrid.samplers.direct import NodeQueries
-from illumgrid.transport.samples import Queries
+from illumgrid.transport.samples import Queries, combine
 from illumgrid.transport.tracer import Tracer
 
 FEW, STORED = 0.02, 75
@@ -31,8 +31,12 @@ NOISE = 3.0
 """Standard errors by which eight corners of equal light differ, about: the range of eight normal numbers is 2.85."""
 MOST = 4.0
 """Nodes lit in all, at most, for each of the coarse lattice."""
-FEWEST, MOST_PATHS = 8, 64
-"""Paths from each node that is lit: most where no finer ones are."""
+PATHS = 8, 16, 32, 64
+"""Paths from each node, of which one is chosen; in all at most the last for each coarse node."""
+BESIDE = 16.0
+"""Paths that take as long as all else that a node costs: to look, to ask and to read."""
+SHARED = 0.5
+"""Share of its nodes' variance that a lookup keeps: 8/27 of noise that they do not share, all of what they share."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +64,68 @@ class Choice:
 
     levels: int
     flat: tuple[NDArray[np.int64], ...]  # numbers in each field's lattice
+    paths: int = PATHS[-1]  # from each of them
     looked: tuple[IlluminationGrid, ...] = ()  # light of the coarsest lattices by a few paths
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What a first look says about the error of a lookup: squares, relative to the mean light.
+
+    Parameters
+    ----------
+    noise : float
+        Of one path.
+    between : float
+        What interpolation between the nodes of the coarsest lattice is off.
+    falls : float
+        By what this is divided when the spacing is halved: 2 where light jumps, 16 where it is smooth.
+    """
+
+    noise: float
+    between: float
+    falls: float
+
+    @classmethod
+    def of(cls, one: NDArray[np.floating], other: NDArray[np.floating]) -> "Seen":
+        """From light (nx, ny, nz) by independent paths, two from each node; NaN where there is none.
+
+        In the mean product of second differences noise cancels. Half a second difference is what linear interpolation
+        is off at a node, had it twice the spacing, and about two thirds of its square the mean square between nodes:
+        with twice the spacing, a sixth of those products, summed over the axes, and less by `falls` with the spacing
+        that there is. `falls` is how much larger the products are two nodes apart.
+        """
+        mean = float(np.nanmean(one + other)) / 2 if np.isfinite(one).any() else 0.0
+        if not mean > 0:
+            return cls(0.0, 0.0, 2.0)
+        near, far = (sum(_bends(one, other, axis, step) for axis in range(3)) / mean**2 for step in (1, 2))
+        falls = float(np.clip(far / near, 2.0, 16.0)) if near > 0 else 2.0
+        return cls(SHARED * float(np.nanmean(np.square(one - other))) / mean**2, max(near, 0.0) / 6 / falls, falls)
+
+    def cost(self, nodes: Sequence[int], paths: int) -> float:
+        """The time of these paths from the nodes of all levels, times the fourth power of the error; 0 is best.
+
+        `nodes` are those of the coarsest level, and with each finer one. Where light jumps, half the spacing takes four
+        times the nodes and halves the squared error: that is the price of accuracy. Infinite for too many paths in all.
+        """
+        if paths > PATHS[0] and paths * nodes[-1] > PATHS[-1] * nodes[0]:
+            return np.inf
+        square = self.between / self.falls ** (len(nodes) - 1) + self.noise / paths
+        return float(square**2 * nodes[-1] * (BESIDE + paths))
+
+    def paths(self, nodes: Sequence[int]) -> int:
+        """Paths from each node, by which the cost is least: powers of two, which spread best; most where all are 0."""
+        return min(reversed(PATHS), key=lambda paths: self.cost(nodes, paths))
+
+
+def _bends(one: NDArray[np.floating], other: NDArray[np.floating], axis: int, step: int) -> float:
+    """Mean product of the second differences, `step` nodes apart, of light by independent paths."""
+    one, other = (np.moveaxis(light, axis, 0) for light in (one, other))
+    if len(one) <= 2 * step:
+        return 0.0
+    first, second = (a[2 * step :] - 2 * a[step:-step] + a[: -2 * step] for a in (one, other))
+    known = np.isfinite(first) & np.isfinite(second)
+    return float((first[known] * second[known]).mean(dtype=float)) if known.any() else 0.0
 
 
 def chosen(
@@ -74,93 +139,100 @@ def chosen(
     map: Map = map,
     progress: Progress = lambda what, done, total: None,
 ) -> Choice:
-    """Choose the nodes to light, from the coarse lattices `base` on and with at most so many levels.
+    """Choose the nodes to light, from the coarse lattices `base` on and with at most so many levels, and their paths.
 
     All nodes of the coarsest level that an isosurface of the range can show, and, level after level, those of the next
     finer one in cells whose corners differ by more than `ROUGH` of the mean light beyond noise, the roughest first, up
-    to `MOST` nodes for each of the coarsest level. A level of few nodes is left out.
+    to `MOST` nodes for each of the coarsest level. A level of few nodes is left out, and one that does not pay: see
+    `Seen.cost`. Fields share the number of paths of the one that has the most nodes.
     """
-    found, looked = [], []
-    for number, spec in enumerate(base):
-        levels_of, first = _of_field(scene, number, spec, levels, tracer, bounces, seed, map, progress)
-        found.append(levels_of)
-        looked.append(first)
-    used = max(len(each) for each in found) - 1
+    looks = [
+        _of_field(scene, number, spec, levels, tracer, bounces, seed, map, progress) for number, spec in enumerate(base)
+    ]
+    used = max(len(found) for found, *_ in looks) - 1
     nodes = []
-    for spec, each in zip(base, found):
+    for spec, (found, *_) in zip(base, looks):
         shape, finest = finer(spec, used).shape, []
-        for level, flat in enumerate(each):
+        for level, flat in enumerate(found):
             place = np.stack(np.unravel_index(flat, finer(spec, level).shape)) << (used - level)
             finest.append(np.ravel_multi_index(tuple(place), shape))
         nodes.append(np.unique(np.concatenate(finest)))
-    return Choice(used, tuple(nodes), tuple(looked))
+    _, paths = max((sum(map(len, found)), paths) for found, _, paths in looks)
+    return Choice(used, tuple(nodes), paths, tuple(grid for _, grid, _ in looks))
 
 
 def _of_field(
     scene: Scene, number: int, spec: GridSpec, levels: int, tracer: Tracer, bounces: int, seed: int, map: Map,
     progress: Progress,
-) -> tuple[list[NDArray[np.int64]], IlluminationGrid]:  # fmt: skip
-    """Nodes of each level, as numbers in its own lattice, and the light of the coarsest by a few paths."""
+) -> tuple[list[NDArray[np.int64]], IlluminationGrid, int]:  # fmt: skip
+    """Nodes of each level, as numbers in its own lattice, the light of the coarsest by a few paths, and how many."""
     field = scene.fields[number]
     flat = reachable(field, spec)
-    found, lit, room = [flat], len(flat), MOST * len(flat)
-    grid, noise = _look(scene, number, spec, flat, tracer, bounces, seed, map, progress)
-    first = grid
+    found, lit, room = [flat], [len(flat)], MOST * len(flat)
+    grid, noise, half = _look(scene, number, spec, flat, tracer, bounces, seed, map, progress)
+    first, seen = grid, _seen(grid, flat, half())
     for level in range(levels):
         if level:
-            grid, noise = _look(scene, number, spec, flat, tracer, bounces, seed, map, progress)
+            grid, noise, _ = _look(scene, number, spec, flat, tracer, bounces, seed, map, progress)
         asked = np.zeros(spec.shape, bool)
         asked.reshape(-1)[flat] = True
         rough = np.where(all_corners(asked), spread(grid), np.float32(0))
         spec = finer(spec, 1)
-        may = np.zeros(spec.shape, bool)
-        may.reshape(-1)[reachable(field, spec)] = True
+        may = reached(field, spec)
         # Corners differ by their noise, too: that of four paths exceeds all else in a room with a small lamp.
         least = ROUGH * grid.mean + NOISE * noise
         more = within(rough > least) & may
-        while lit + int(more.sum()) > room:  # raise the limit until there is room
+        while lit[-1] + int(more.sum()) > room:  # raise the limit until there is room
             least *= 1.25
             more = within(rough > least) & may
         flat = np.flatnonzero(more)
-        lit += len(flat)
-        if len(flat) <= FEW * lit or more.size > STORED * lit:
+        finest = [*lit, lit[-1] + len(flat)]
+        if len(flat) <= FEW * finest[-1] or more.size > STORED * finest[-1]:
+            break
+        if seen.cost(finest, seen.paths(finest)) >= seen.cost(lit, seen.paths(lit)):
             break
         found.append(flat)
-    return found, first
+        lit = finest
+    return found, first, seen.paths(lit)
 
 
 def _look(
     scene: Scene, number: int, spec: GridSpec, flat: NDArray[np.int64], tracer: Tracer, bounces: int, seed: int,
     map: Map, progress: Progress,
-) -> tuple[IlluminationGrid, float]:  # fmt: skip
-    """Light of these nodes by a few paths, with random numbers of their own, and its standard error from noise."""
+) -> tuple[IlluminationGrid, float, Callable[[], NDArray[np.float32]]]:  # fmt: skip
+    """Light of these nodes by a few paths, with random numbers of their own, and its standard error from noise.
+
+    And what reads the light (n, C) that the first half of the paths alone would have. The halves are independent: those
+    of one sequence are not, as it spreads its paths.
+    """
     nodes = Nodes(spec, scene.fields[number], number)
-    looked = Bake.of([NodeQueries(scene, number, spec, flat)], bounces, shifted_seed(seed, 2**59)).walk(
-        tracer, range(LOOKED), map, lambda what, done, total: progress("first look", done, total)
-    )
-    samples = looked.samples
+    queries = [NodeQueries(scene, number, spec, flat)]
+    one, other = (
+        Bake.of(queries, bounces, shifted_seed(seed, start)).walk(
+            tracer, range(LOOKED // 2), map, lambda what, done, total: progress("first look", done, total)
+        ).samples
+        for start in (2**59, 3 * 2**59)
+    )  # fmt: skip
+    samples = combine(one, other)
     light = np.zeros((*spec.shape, len(samples.channels)), np.float32)  # holes stay dark: nobody reads them
     error, support = np.full(spec.shape, np.inf, np.float32), np.zeros(spec.shape, np.float32)
     for every, some in zip((light, error, support), read(samples, nodes, nodes, flat)):
         every.reshape(-1, *every.shape[3:])[flat] = some
     grid, lit = IlluminationGrid(spec, light, error, support, samples.channels), samples.paths > 0
-    if not lit.any():
-        return grid, 0.0
-    return grid, float(np.median(samples.error[lit]) / np.sqrt(np.median(grid.support[grid.support > 0])))
+    noise = 0.0
+    if lit.any():
+        noise = float(np.median(samples.error[lit]) / np.sqrt(np.median(grid.support[grid.support > 0])))
+    return grid, noise, lambda: read(one, nodes, nodes, flat)[0]
 
 
-def paths_for(choice: Choice, base: Sequence[GridSpec]) -> int:
-    """Paths from each node: a power of two, which spreads them best, the fewer, the more nodes are lit.
-
-    `MOST_PATHS` divided by the 1.5th power of the lit nodes for each coarse one: among more nodes noise averages out,
-    and where light is rough it counts for less than the jumps.
-    """
-    lit, coarse = sum(map(len, choice.flat)), 0
-    for flat, spec in zip(choice.flat, base):
-        place = np.stack(np.unravel_index(flat, finer(spec, choice.levels).shape))
-        coarse += int((place % 2**choice.levels == 0).all(axis=0).sum())
-    share = MOST_PATHS * (coarse / max(lit, 1)) ** 1.5
-    return int(np.clip(2 ** np.floor(np.log2(max(share, 1.0))), FEWEST, MOST_PATHS))
+def _seen(grid: IlluminationGrid, flat: NDArray[np.int64], half: NDArray[np.float32]) -> Seen:
+    """What the light of a grid says, of which half of the paths alone have the light (n, C) at these nodes."""
+    whole, one = (np.full(grid.spec.shape, np.nan) for _ in range(2))
+    shown = grid.channels.shown
+    whole.reshape(-1)[flat] = shown(grid.light.reshape(-1, len(grid.channels))[flat]).mean(axis=-1)
+    one.reshape(-1)[flat] = shown(half).mean(axis=-1)
+    one[grid.support == 0] = np.nan
+    return Seen.of(one, 2 * whole - one)  # reading is linear in the light
 
 
 def written(choice: Choice, base: Sequence[GridSpec]) -> dict[str, Any]:

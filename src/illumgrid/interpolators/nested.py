@@ -117,10 +117,12 @@ def _coarsest(samples: Samples, place: NDArray[np.int64], nodes: Nodes, own: Nod
 
 def _around(fresh: NDArray[np.bool_], place: NDArray[np.int64], nodes: Nodes, step: int) -> NDArray[np.bool_]:
     """Which nodes (n, 3) are `fresh`, of this level alone, or beside one: those of cells that are halved here."""
-    marked = np.zeros(np.array(nodes.spec.shape) // step + 3, bool)
-    marked[tuple((place[fresh] // step + 1).T)] = True
-    found = fresh.copy()
-    old = np.flatnonzero(~fresh)
-    for toward in np.ndindex(3, 3, 3):
-        found[old] |= marked[tuple((place[old] // step + np.array(toward)).T)]
-    return found
+    near = np.zeros(np.array(nodes.spec.shape) // step + 1, bool)
+    near[tuple((place[fresh] // step).T)] = True
+    for axis in range(3):
+        line = np.moveaxis(near, axis, 0)
+        beside = line.copy()
+        beside[1:] |= line[:-1]
+        beside[:-1] |= line[1:]
+        near = np.moveaxis(beside, 0, axis)
+    return np.asarray(near[tuple((place // step).T)])
