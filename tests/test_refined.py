@@ -94,7 +94,7 @@ def looked_at(light, noise, seed=0):
     return Seen.of(*(light + noise * random.standard_normal(light.shape) for _ in range(2)))
 
 
-def test_noise_and_what_lies_between_nodes_are_told_apart():
+def test_noise_is_separated_from_what_lies_between_nodes():
     x = np.linspace(-1, 1, 41)[:, None, None] + np.zeros((41, 41, 41))
     straight = looked_at(1 + 0.3 * x, 0.1)
     assert straight.noise == pytest.approx(SHARED * 2 * 0.1**2, rel=0.05) and straight.between < 1e-4
