@@ -17,15 +17,14 @@ from illumgrid.accuracy.judge import judge_walls as measure_walls
 from illumgrid.accuracy.probe import FEWEST_PATHS, MOST_PATHS
 from illumgrid.bake import Baked, bake
 from illumgrid.bake.accumulator import Map, Progress
-from illumgrid.bake.ahead import Ahead, by_normal_in, light_ahead, refinable_by
+from illumgrid.bake.ahead import BY_NORMAL, Ahead, by_normal_in, light_ahead, refinable_by
 from illumgrid.bake.bounces import enough_bounces, has_long_paths, light_left_out
-from illumgrid.constants import BASE, PATHS, PATHS_BY_NORMAL
+from illumgrid.constants import BASE, PATHS
 from illumgrid.errors import BadInput, tell, tell_after
 from illumgrid.field.lattice import specs_over
 from illumgrid.field.layers import layers_of
 from illumgrid.field.scene import Levels, Scene, finer_texels, level_table, with_texels
 from illumgrid.grid import GridSpec
-from illumgrid.interpolators.bilateral import Bilateral
 from illumgrid.io import needs, store
 from illumgrid.light import Illumination
 from illumgrid.stages import Backend, Interpolator, Sampler
@@ -44,6 +43,22 @@ def load(folder: str | os.PathLike[str]) -> Illumination:
 
 def _stage(kind: str, given: Any, options: dict[str, Any] | None = None) -> Any:
     return registry.make(kind, given, options or {}) if isinstance(given, str) else given
+
+
+def _stages(sampler: Any, backend: Any, interpolator: Any, isovalues: int | None) -> tuple[Any, Any, Any]:
+    """The three stages; `isovalues`, if given, are the count of a sampler that is named and has one."""
+    named = isovalues is not None and isinstance(sampler, str)
+    options = {"count": isovalues} if named and "count" in registry.option_names("sampler", sampler) else {}
+    return _stage("sampler", sampler, options), _stage("backend", backend), _stage("interpolator", interpolator)
+
+
+def _check_needs(
+    scene: Scene, specs: Sequence[GridSpec], levels: Levels, chosen: tuple[Any, Any, Any], *, held: bool, refining: bool
+) -> None:
+    """Refuse what needs more memory than there is."""
+    at_nodes = not held and chosen[0].name == "direct" and chosen[2].name in ("nearest", "bilateral")
+    density = getattr(chosen[2], "density", 1.0)
+    needs.check_run(scene, specs, levels, density, at_nodes=at_nodes, refining=refining)
 
 
 def _described(stage: Any) -> dict[str, Any]:
@@ -128,10 +143,7 @@ def run(
     paths, bounces, seed = _whole_numbers(paths, bounces, seed)
     scene = scene if texels is None else with_texels(scene, texels)
     levels = level_table(scene, 32 if isovalues is None else isovalues)
-    options = {}
-    if isovalues is not None and isinstance(sampler, str) and "count" in registry.option_names("sampler", sampler):
-        options["count"] = isovalues
-    chosen = _stage("sampler", sampler, options), _stage("backend", backend), _stage("interpolator", interpolator)
+    chosen = _stages(sampler, backend, interpolator, isovalues)
     begun, tracer = time.perf_counter(), prepare(chosen[1], scene)
     before = None if keep is None else keep.chosen
     at_once = bool(keep and keep.at_once)
@@ -155,12 +167,10 @@ def run(
     refining = before.get("refined") if before else plan["looked"] if plan else refinable
     by_normal = before.get("by_normal") if before else grid is None and not at_once and by_normal_in(scene, *chosen)
     if by_normal:
-        chosen = chosen[0], chosen[1], Bilateral(1.0)
+        chosen = chosen[0], chosen[1], BY_NORMAL[0]
     specs = specs_over(scene, grid, BASE) if refining else specs_over(scene, grid)
     held = any(field.isovalue is not None for field in scene.fields)  # such rows are in no cache's sweep
-    at_nodes = not held and chosen[0].name == "direct" and chosen[2].name in ("nearest", "bilateral")
-    density = getattr(chosen[2], "density", 1.0)
-    needs.check_run(scene, specs, levels, density, at_nodes=at_nodes, refining=bool(refining))
+    _check_needs(scene, specs, levels, chosen, held=held, refining=bool(refining))
     automatic = bounces is None or cached
     if bounces is None:
         bounces, left_out = enough_bounces(scene, tracer, seed)
@@ -176,7 +186,7 @@ def run(
     first = {ahead.name: time.perf_counter() - clock} if ahead.name else {}
     if ahead.cached and not before:
         left_out = light_left_out(scene, ahead.tracer, bounces, seed)
-    walked = _paths_of(before, plan, paths, error, seconds, begun, PATHS_BY_NORMAL if by_normal else ahead.paths)
+    walked = _paths_of(before, plan, paths, error, seconds, begun, BY_NORMAL[1] if by_normal else ahead.paths)
     if keep is not None:
         fixed = None if isinstance(walked, Iterator) else max(r.stop for r in walked)
         about = {"cache": ahead.cached, "grid": grid, "bounces": bounces, "left_out": left_out, "paths": fixed}
@@ -188,8 +198,7 @@ def run(
     )  # fmt: skip
     _note_holes(scene, baked)
     said = {"bounces": bounces, "left_out": left_out, "by_normal": bool(by_normal), "seed": seed, "plan": plan}
-    said["isovalues"] = len(levels.table)
-    recipe = {**_chosen(chosen, ahead, specs), **said, **_measured(baked, first)}
+    recipe = {**_chosen(chosen, ahead, specs), **said, "isovalues": len(levels.table), **_measured(baked, first)}
     light = Illumination(scene, levels, baked.grids, baked.walls, recipe)
     return judged(light, chosen[1], tracer) if judge else light
 

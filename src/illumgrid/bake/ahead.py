@@ -6,17 +6,21 @@ from typing import Any
 
 from illumgrid.bake.known import light_known_first
 from illumgrid.bake.refined import ROUGH, Chosen, chosen, written
-from illumgrid.constants import PATHS
+from illumgrid.constants import PATHS, PATHS_BY_NORMAL
 from illumgrid.field.diagnosis import noisy
 from illumgrid.field.layers import layers_of
 from illumgrid.field.scene import Levels, Scene
 from illumgrid.grid import GridSpec
 from illumgrid.grid.cache import cache_of
 from illumgrid.grid.nested import finer, halvings
+from illumgrid.interpolators.bilateral import Bilateral
 from illumgrid.interpolators.nested import Nested
 from illumgrid.stages import Interpolator, Sampler
 from illumgrid.transport.stages import capabilities
 from illumgrid.transport.tracer import Tracer, ending_in
+
+BY_NORMAL: tuple[Interpolator, int] = Bilateral(1.0), PATHS_BY_NORMAL
+"""What reads nodes by level and normal, and how many paths suffice for it."""
 
 
 @dataclass(frozen=True, eq=False)
