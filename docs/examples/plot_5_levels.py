@@ -42,7 +42,7 @@ samplers = {
 figure, axes = plt.subplots(2, 3, figsize=(10, 6.6), height_ratios=(1, 1.05), layout="constrained")
 low, high = scene.fields[0].range
 for (name, sampler), top, bottom in zip(samplers.items(), *axes):
-    light = ig.run(scene, sampler=sampler, grid=40, paths=64, bounces=4)
+    light = ig.run(scene, sampler=sampler, grid=40, paths=64, bounces=4, isovalues=6)
     slice_ = volume.values[:, :, volume.shape[2] // 2].T
     top.imshow(slice_, origin="lower", cmap="gray")
     if name == "direct":
