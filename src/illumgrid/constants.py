@@ -3,9 +3,6 @@
 PATHS = 32
 """Paths from every query when nothing else is asked for."""
 
-PATHS_BY_NORMAL = 16
-"""The same where noisy data are read by level and normal, which takes the mean of what lies around a point."""
-
 DENSITY, LONGEST = 1.2, 150
 """Nodes per voxel along an axis, and nodes along the longest axis at most, when nothing else is asked for.
 

@@ -6,7 +6,7 @@ from typing import Any
 
 from illumgrid.bake.known import light_known_first
 from illumgrid.bake.refined import ROUGH, Chosen, chosen, written
-from illumgrid.constants import PATHS, PATHS_BY_NORMAL
+from illumgrid.constants import PATHS
 from illumgrid.field.diagnosis import noisy
 from illumgrid.field.layers import layers_of
 from illumgrid.field.scene import Levels, Scene
@@ -19,8 +19,8 @@ from illumgrid.stages import Interpolator, Sampler
 from illumgrid.transport.stages import capabilities
 from illumgrid.transport.tracer import Tracer, ending_in
 
-BY_NORMAL: tuple[Interpolator, int] = Bilateral(1.0), PATHS_BY_NORMAL
-"""What reads nodes by level and normal, and how many paths suffice for it."""
+BY_NORMAL: tuple[Interpolator, int] = Bilateral(1.0), 16
+"""What reads nodes by level and normal, and how many paths suffice for it, which takes the mean of those around."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,16 +16,15 @@ from illumgrid.accuracy.points import unseen_on_level_sets
 from illumgrid.accuracy.probe import Measured, Probe
 from illumgrid.accuracy.reference import Reference, begin, converge
 from illumgrid.bake.accumulator import Progress
-from illumgrid.bake.ahead import by_normal_in, refinable_by
+from illumgrid.bake.ahead import BY_NORMAL, by_normal_in, refinable_by
 from illumgrid.bake.bounces import enough_bounces, light_left_out
 from illumgrid.bake.refined import LOOKED
-from illumgrid.constants import BASE, DENSITY, PATHS, PATHS_BY_NORMAL
+from illumgrid.constants import BASE, DENSITY, PATHS
 from illumgrid.errors import BadInput
 from illumgrid.field.lattice import specs_over
 from illumgrid.field.scene import Scene
 from illumgrid.grid import GridSpec
 from illumgrid.grid.nodes import reachable
-from illumgrid.interpolators.bilateral import Bilateral
 from illumgrid.interpolators.nearest import Nearest
 from illumgrid.interpolators.nested import Nested
 from illumgrid.rng import shifted_seed
@@ -190,7 +189,8 @@ def _show_default(race: Race, grid: int | None, paths: int | None, budget: float
         filler = Nested()
         method = replace(plain, interpolators=(filler,), denser=None, looked=True)
     elif grid is None and by_normal_in(scene, plain.sampler, plain.backend, filler):
-        filler, paths = Bilateral(1.0), paths or PATHS_BY_NORMAL
+        filler, usual = BY_NORMAL
+        paths = paths or usual
         method = replace(plain, interpolators=(filler,), denser=None)
     base = specs_over(scene, grid, BASE if method.looked else DENSITY)
     shapes, begun = {max(spec.shape) for spec in base}, time.perf_counter()
