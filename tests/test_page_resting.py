@@ -99,6 +99,17 @@ def test_only_what_changes_the_light_starts_the_rays_again(browser):  # noqa: F8
     assert not browser.troubles
 
 
+def test_a_driver_that_refuses_the_shaders_of_rays_leaves_the_lookups(browser):  # noqa: F811
+    page = browser.open(coloured(pair()), anew=True)
+    before, switch = browser.pixels(), page.locator('[data-part="refine"]')
+    assert switch.is_visible() and page.evaluate("illumgrid.resting.made === undefined")  # not before rays begin
+    page.evaluate("illumgrid.resting.make = () => { throw new Error('refused'); }; illumgrid.put({ rest: true })")
+    after = browser.pixels()
+    browser.shown = None  # this page has no rays any more
+    assert not switch.is_visible() and not browser.troubles
+    np.testing.assert_array_equal(before, after)
+
+
 def test_pages_that_cannot_gather_have_no_switch_for_it(browser):  # noqa: F811
     (field,) = bent().fields
     shining = replace(bent(), fields=(replace(field, name="shining", material=Material((0.5,) * 3, (1.0, 0, 0))),))

@@ -35,9 +35,19 @@ export class Resting {
   }
 
   constructor(picture, shaders, data) {
-    const { gl } = picture, shared = shaders["shared.glsl"], march = shared + shaders["march.glsl"], ray = shaders["ray.vert"];
-    Object.assign(this, { picture, gl, data, scene: picture.scene, key: "", size: "" });
-    this.programs = {
+    Object.assign(this, { picture, shaders, data, gl: picture.gl, scene: picture.scene, key: "", size: "" });
+    this.surfaces = [...this.scene.fields, ...this.scene.walls];
+    this.trial = this.targets(...TRIAL);
+  }
+
+  // Made when rays begin: the first picture need not wait for them.
+  get programs() {
+    return (this.made ??= this.make());
+  }
+
+  make() {
+    const { gl, shaders } = this, shared = shaders["shared.glsl"], march = shared + shaders["march.glsl"], ray = shaders["ray.vert"];
+    return {
       origin: program(gl, ray, march + shaders["origin.frag"]),
       originWall: program(gl, shaders["wall.vert"], shared + shaders["origin_wall.frag"]),
       sky: program(gl, ray, shared + shaders["gather.glsl"] + shaders["gather_sky.frag"]),
@@ -46,8 +56,6 @@ export class Resting {
       blend: program(gl, ray, shaders["blend.frag"]),
       show: program(gl, ray, shared + shaders["rest.frag"]),
     };
-    this.surfaces = [...this.scene.fields, ...this.scene.walls];
-    this.trial = this.targets(...TRIAL);
   }
 
   targets(width, height) {

@@ -19,7 +19,8 @@ const QUICK = 60; // frames faster than this are refined beyond the four samples
 export function view(root, scene, data, shaders, { address = true, onChange = () => {}, get } = {}) {
   const part = (name) => root.querySelector(`[data-part="${name}"]`);
   const canvas = part("canvas"), stage = part("stage");
-  const picture = new Picture(canvas, scene, data, shaders), resting = Resting.of(picture, shaders, data);
+  const picture = new Picture(canvas, scene, data, shaders);
+  let resting = Resting.of(picture, shaders, data);
   const opened = { ...DEFAULTS, weights: scene.lights.map((light) => light.weight) }, state = { ...opened };
   let changed = -Infinity, samples = 0, coarse = 2, asked = false, written_ = "", fresh = true, rests = false;
 
@@ -132,8 +133,15 @@ export function view(root, scene, data, shaders, { address = true, onChange = ()
     rests = resting && state.rest && state.light === "global" && !state.trust;
     part("rays").value = "";
     if (rests) {
-      resting.begin(state, canvas.width, canvas.height, view_.took);
-      draw(false);
+      try {
+        resting.begin(state, canvas.width, canvas.height, view_.took);
+        draw(false);
+      } catch (error) {  // a driver may refuse shaders of rays alone: lookups go on
+        console.warn(error.message);
+        resting = null;
+        rests = false;
+        part("refine").hidden = true;
+      }
     }
     canvas.setAttribute("aria-busy", "false");
     if (!address) return;
