@@ -50,6 +50,14 @@ def test_nodes_that_no_isosurface_of_the_range_meets_take_little():
     assert needs._share(scene.fields[0], spec) < 0.4 * needs._share(wide.fields[0], spec)
 
 
+def test_voxels_that_are_looked_at_some_at_a_time_give_the_same_share(monkeypatch):
+    scene = Scene.sky(ball(20), range=(0.5, 0.52))
+    (spec,) = specs_over(scene, 20)
+    share = needs._share(scene.fields[0], spec)
+    monkeypatch.setattr(needs, "_NEAR", 77)
+    assert 0 < share < 1 and needs._share(scene.fields[0], spec) == share
+
+
 def test_a_denser_grid_and_layers_of_light_are_counted(free):
     scene = Scene.studio(ball(10)).in_harmonics(2)
     specs, levels = specs_over(scene, 40), level_table(scene, 2)

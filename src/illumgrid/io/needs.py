@@ -39,8 +39,9 @@ node of the finest lattice: 9³ for 8³ nodes, and those of the coarser levels."
 _BLOCK, _BLOCK_CHANNEL, _FINEST = 80, 8, 4
 """Bytes for each node of the blocks, and for each of its channels, while they are filled, with the moments of lit nodes
 (`aquarius-A2`: 88 with one channel, 101 with three); bytes for each node of the finest lattice, for marks."""
-_SOME = 50_000
-"""Voxels that are looked at to learn what share of the nodes is asked about."""
+_SOME, _NEAR = 50_000, 1_000
+"""Voxels that are looked at to learn what share of the nodes is asked about, and those whose surroundings are looked at
+together."""
 
 
 def check(what: str, need: float, todo: str) -> None:
@@ -108,10 +109,12 @@ def _share(field: "Field", spec: GridSpec) -> float:
     last = np.array(values.shape) - 1
     cell = np.ceil(last / np.maximum(np.array(spec.shape) - 1, 1)).astype(np.int64)
     some = np.arange(0, values.size, max(1, values.size // _SOME))
-    index = np.stack(np.unravel_index(some, values.shape), axis=1)
-    low, high = sorted(field.stored_range)
-    least, most = (np.full(len(some), end, float) for end in (np.inf, -np.inf))
-    for way in np.ndindex(3, 3, 3):
-        near = values[tuple(np.clip(index + (np.array(way) - 1) * cell, 0, last).T)]
-        least, most = np.fmin(least, near), np.fmax(most, near)
-    return float(((most >= low) & (least <= high)).mean())
+    (low, high), met = sorted(field.stored_range), 0
+    for first in range(0, len(some), _NEAR):  # all ways at a time: a field that is paged is read once
+        index = np.stack(np.unravel_index(some[first : first + _NEAR], values.shape), axis=1)
+        least, most = (np.full(len(index), end, float) for end in (np.inf, -np.inf))
+        for way in np.ndindex(3, 3, 3):
+            near = values[tuple(np.clip(index + (np.array(way) - 1) * cell, 0, last).T)]
+            least, most = np.fmin(least, near), np.fmax(most, near)
+        met += int(((most >= low) & (least <= high)).sum())
+    return met / len(some)

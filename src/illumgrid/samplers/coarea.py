@@ -1,11 +1,14 @@
 """Points that are uniform by area on level sets, each on one of its own: no surface is extracted."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from illumgrid.field.scene import Field, Scene
+from illumgrid.field.storing import read_at_random
 from illumgrid.field.volume import AT_ONCE, Floats, cell_gradient, index_to_world, interpolate
 from illumgrid.transport.samples import Queries, join_queries
 
@@ -30,10 +33,10 @@ def points_on_level_sets(scene: Scene, points: int, seed: tuple[int, ...]) -> Qu
         chance = cells.chance(tried)
         shape = tuple(n - 1 for n in field.volume.shape)
         index = np.stack(np.unravel_index(cells.number[tried], shape), axis=1) + random.random((len(tried), 3))
-        share = field.place(interpolate(field.volume, index))
+        share = field.place(_in_order(partial(interpolate, field.volume), index))
         kept = (share >= 0) & (share <= 1)
         index, step = index[kept], np.minimum(share[kept] * _STEPS, _STEPS - 1).astype(int)
-        weight = np.linalg.norm(cell_gradient(field.volume, index), axis=1) / chance[kept]
+        weight = np.linalg.norm(_in_order(partial(cell_gradient, field.volume), index), axis=1) / chance[kept]
         total = np.bincount(step, weight, minlength=_STEPS)
         weight = weight / np.where(total > 0, total, 1.0)[step]
         if weight.any():
@@ -42,11 +45,21 @@ def points_on_level_sets(scene: Scene, points: int, seed: tuple[int, ...]) -> Qu
             mass = np.cumsum(weight[order]) / weight.sum()
             chosen = order[np.searchsorted(mass, (np.arange(points) + random.random()) / points).clip(0, len(mass) - 1)]
             world = index_to_world(field.volume, index[np.unique(chosen)])
-            found.append(Queries.at(scene, world, field=number, first_id=number << 40))
+            with read_at_random([field.volume.stored]):  # few, and far from each other
+                found.append(Queries.at(scene, world, field=number, first_id=number << 40))
     if not found:
         return Queries.at(scene, np.zeros((0, 3)))
     asked = join_queries(found)
     return asked[np.flatnonzero(asked.normal.any(axis=1))]
+
+
+def _in_order(look: Callable[[Floats], Floats], index: Floats) -> Floats:
+    """What is found at indices (n, 3), which are looked at slab by slab: a field that is paged is then read once."""
+    order = np.argsort(index[:, 0])
+    found = look(index[order])
+    back = np.empty_like(found)
+    back[order] = found
+    return back
 
 
 @dataclass(frozen=True, eq=False)
