@@ -18,7 +18,7 @@ from illumgrid.stages import Interpolator, hookimpl
 from illumgrid.transport.samples import Samples
 
 _BLOCK = 1 << 14  # samples of which queries are held
-_SLAB, _CHUNK = 1 << 16, 1 << 12  # nodes that are read while the samples around them are held, and by one thread
+_SLAB, _CHUNK = 1 << 18, 1 << 12  # samples that are held in order, about, and nodes that one thread reads at a time
 _ON_A_NODE = 1e-6  # of a spacing
 
 
@@ -175,13 +175,13 @@ def _read(
     from illumgrid.grid.reading import MOVED
 
     spec, stored = nodes.spec, dense.spec.shape
-    none = np.zeros(0, np.intp)
-    plane, done = _planes(samples, spec), 0
+    none, done = np.zeros(0, np.intp), 0
     around: list[NDArray[Any]] = [*_in_order(samples, none, nodes)]
     ratio = (spec.shape[0] - 1) / (stored[0] - 1)
     reach = 2.5 + MOVED * (spec.shape[0] - 1) / (nodes.field.volume.shape[0] - 1) + 1e-6
     each = stored[1] * stored[2]
-    thick = max(1, _SLAB // each)
+    thick = max(1, _SLAB * stored[0] // max(len(samples), 1))
+    plane = _planes(samples, spec) if thick < stored[0] else np.zeros(len(samples), np.int16)
     with ThreadPoolExecutor(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else None) as pool:
         for first in range(0, stored[0], thick):
             last = min(first + thick, stored[0]) - 1
