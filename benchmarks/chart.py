@@ -238,7 +238,10 @@ def volumes(asked):
         content, summary = files(result, name.split(".")[0], scene)
         (asked.json.parent / f"chart-{name.split('.')[0]}.png").write_bytes(content["chart.png"])
         exact = result.references["levelset"]
-        default = next(p for p in result.points if p.default)
+        default = next((p for p in result.points if p.default), None)
+        if default is None:  # its first look would take too much of the budget
+            print(f"  {name:20} {'; '.join(result.notes)}", flush=True)
+            continue
         took, rmse = default.time, default.rmse(exact)
         error = {p: p.rmse(result.references[p.method.surface]) for p in result.points}
         dominating = [p for p in result.front if p.time < took and error[p] < rmse]
