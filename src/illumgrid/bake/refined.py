@@ -31,7 +31,7 @@ NOISE = 3.0
 """Standard errors by which eight corners of equal light differ, about: the range of eight normal numbers is 2.85."""
 MOST = 4.0
 """Nodes lit in all, at most, for each of the coarse lattice."""
-PATHS = 8, 16, 32, 64
+PATH_COUNTS = 8, 16, 32, 64
 """Paths from each node, of which one is chosen; in all at most the last for each coarse node."""
 BESIDE = 16.0
 """Paths that take as long as all else that a node costs: to look, to ask and to read."""
@@ -64,7 +64,7 @@ class Choice:
 
     levels: int
     flat: tuple[NDArray[np.int64], ...]  # numbers in each field's lattice
-    paths: int = PATHS[-1]  # from each of them
+    paths: int = PATH_COUNTS[-1]  # from each of them
     looked: tuple[IlluminationGrid, ...] = ()  # light of the coarsest lattices by a few paths
 
 
@@ -108,14 +108,14 @@ class Seen:
         `nodes` are those of the coarsest level, and with each finer one. Where light jumps, half the spacing takes four
         times the nodes and halves the squared error: that is the price of accuracy. Infinite for too many paths in all.
         """
-        if paths > PATHS[0] and paths * nodes[-1] > PATHS[-1] * nodes[0]:
+        if paths > PATH_COUNTS[0] and paths * nodes[-1] > PATH_COUNTS[-1] * nodes[0]:
             return np.inf
         square = self.between / self.falls ** (len(nodes) - 1) + self.noise / paths
         return float(square**2 * nodes[-1] * (BESIDE + paths))
 
     def paths(self, nodes: Sequence[int]) -> int:
         """Paths from each node, by which the cost is least: powers of two, which spread best; most where all are 0."""
-        return min(reversed(PATHS), key=lambda paths: self.cost(nodes, paths))
+        return min(reversed(PATH_COUNTS), key=lambda paths: self.cost(nodes, paths))
 
 
 def _bends(one: NDArray[np.floating], other: NDArray[np.floating], axis: int, step: int) -> float:
