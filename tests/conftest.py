@@ -7,17 +7,12 @@ import os
 import signal
 import sys
 import time
-from collections import Counter
 
-import numba
 import numpy as np
 import pytest
 import typer
-from _pytest.assertion import rewrite
-from numba.core.dispatcher import Dispatcher
 
 import illumgrid as ig
-import naive
 from illumgrid import chain, cli
 from illumgrid import show as preview
 from illumgrid.compiled import _Cache
@@ -32,28 +27,6 @@ except ImportError:  # on Windows every worker compiles
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False
 
-
-@contextlib.contextmanager
-def uncounted():
-    """Without the trace of coverage, which doubles the time of plain Python; that of a debugger stays."""
-    trace = sys.gettrace()
-    counted = type(trace).__module__.startswith("coverage")
-    if counted:
-        sys.settrace(None)
-    try:
-        yield
-    finally:
-        if counted:
-            sys.settrace(trace)
-
-
-# Not ours to count: the compiler of Numba, a third of the suite with coverage, what pytest makes of assertions, and the
-# loops of the oracle.
-Dispatcher.compile = uncounted()(Dispatcher.compile)
-rewrite.rewrite_asserts = uncounted()(rewrite.rewrite_asserts)
-for loops in ("path_worth", "is_hole", "solve"):
-    setattr(naive, loops, uncounted()(getattr(naive, loops)))
-
 # Typer makes all commands anew for each call, which takes longer than most of what 2,000 calls below ask for.
 typer.main.get_command = functools.cache(typer.main.get_command)
 
@@ -67,18 +40,6 @@ chain.run.__kwdefaults__["judge"] = False
 for stop, action in (("SIGINT", signal.default_int_handler), ("SIGHUP", signal.SIG_DFL)):
     if hasattr(signal, stop) and signal.getsignal(getattr(signal, stop)) is signal.SIG_IGN:
         signal.signal(getattr(signal, stop), action)
-
-
-_cases: Counter = Counter()
-
-
-@pytest.hookimpl(wrapper=True)
-def pytest_pyfunc_call(pyfuncitem):
-    """Coverage counts only the first cases of a test whose cases are `alike`; all where kernels are plain Python."""
-    _cases[name := pyfuncitem.nodeid.partition("[")[0]] += 1
-    known = _cases[name] > 4 and pyfuncitem.get_closest_marker("alike") and not numba.config.DISABLE_JIT
-    with uncounted() if known else contextlib.nullcontext():
-        return (yield)
 
 
 @pytest.fixture

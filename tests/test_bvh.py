@@ -177,7 +177,6 @@ def test_ties_go_to_the_lowest_number():
     assert (t == t3).all() and (np.where(face3 >= 0, order[face3], -1) == face).mean() > 0.999
 
 
-@pytest.mark.alike
 @pytest.mark.parametrize("scale", [1e-6, 1e-3, 1.0, 1e3, 1e6])
 @pytest.mark.parametrize("shift", [0.0, 1e5])
 def test_nothing_escapes_from_a_sealed_cavity(cavity, scale, shift):

@@ -78,7 +78,6 @@ def worth(tracer, queries, path, bounces):
     return answer.mean.astype(float) / math.pi, answer.paths == 1
 
 
-@pytest.mark.alike
 @pytest.mark.plain
 @pytest.mark.parametrize("name", SCENES)
 def test_loops_numpy_and_kernels_end_the_same_paths(name):
@@ -198,7 +197,6 @@ KNOWN = {
 }
 
 
-@pytest.mark.alike
 @pytest.mark.parametrize("name, look", [*((n, False) for n in KNOWN), *((n, True) for n in KNOWN if "box" not in n)])
 def test_the_light_of_paths_that_end_is_off_by_less_than_the_bound_in_the_mean(name, look):
     scene = KNOWN[name]()

@@ -61,7 +61,6 @@ def straight(request):
     return volume, limits, inside, direct_grid(volume, limits, inside)
 
 
-@pytest.mark.alike
 @pytest.mark.parametrize("name", TURNS)
 def test_the_direct_grid_turns_with_the_array(straight, name):
     volume, limits, inside, grid = straight

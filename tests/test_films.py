@@ -40,7 +40,6 @@ SCENES = {
 }
 
 
-@pytest.mark.alike
 @pytest.mark.plain
 @pytest.mark.parametrize("name", SCENES)
 @pytest.mark.parametrize("known", [False, True])

@@ -28,7 +28,6 @@ def questions(scene, count, seed=0):
     return join_queries([solid[np.sort(pick)], on_quads(scene, count, seed=seed, back="both")])
 
 
-@pytest.mark.alike
 @pytest.mark.parametrize("name", ROOMS)
 def test_loops_numpy_and_kernels_walk_the_same_paths(name):
     scene = ROOMS[name]()
@@ -48,7 +47,6 @@ def test_loops_numpy_and_kernels_walk_the_same_paths(name):
     assert lit > 20
 
 
-@pytest.mark.alike
 @pytest.mark.parametrize("name", ROOMS)
 def test_numpy_and_kernels_agree_on_many_paths(name):
     scene = ROOMS[name]()
@@ -124,7 +122,6 @@ def at_the_corners(scene, queries):
     return replace(queries, point=corner + u * along + v * across)
 
 
-@pytest.mark.alike
 @pytest.mark.parametrize("axes", [np.eye(3), rotation() @ np.diag([1, 1, -1.0])], ids=["straight", "oblique"])
 @pytest.mark.parametrize("extents", [0.0, 1e5])
 @pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])

@@ -167,7 +167,6 @@ def test_mesh_and_level_set_differ_like_the_square_of_the_spacing():
 # Sealed cavities.
 
 
-@pytest.mark.alike
 @pytest.mark.parametrize("extents", [0.0, 1e5])
 @pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
 @pytest.mark.parametrize("backend", ["numba", pytest.param("embree", marks=needs_embree)])

@@ -96,7 +96,6 @@ def test_pictures_and_pages_are_the_same(lights):
     assert about == about_single and data == data_single
 
 
-@pytest.mark.alike
 @pytest.mark.parametrize("inside", ["above", "below"])
 def test_the_reference_and_meshes_are_the_same(kind, inside):
     found = []

@@ -63,7 +63,6 @@ def differences(one, other):
     return np.abs(one - other).max(axis=-1) > SAME
 
 
-@pytest.mark.alike
 @pytest.mark.parametrize("name", SCENES)
 def test_loops_and_kernels_walk_the_same_paths(name, monkeypatch):
     scene = colored(SCENES[name]())
@@ -96,7 +95,6 @@ def test_loops_and_kernels_walk_the_same_paths(name, monkeypatch):
     assert (kinds["dip"] > 0) == (name != "smallest")
 
 
-@pytest.mark.alike
 @pytest.mark.parametrize("name", SCENES)
 def test_numpy_and_kernels_walk_the_same_paths(name):
     scene = colored(SCENES[name]())

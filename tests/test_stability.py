@@ -103,7 +103,6 @@ def lit(scene, sampler, interpolator, paths=4, **more):
         )  # fmt: skip
 
 
-@pytest.mark.alike
 @pytest.mark.parametrize("sampler, interpolator", list(product(SAMPLERS, INTERPOLATORS)))
 @pytest.mark.parametrize("case", HARD)
 def test_light_stays_light(case, sampler, interpolator):

@@ -44,7 +44,6 @@ FURNACES = {
 }
 
 
-@pytest.mark.alike
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("name", FURNACES)
 def test_in_a_white_furnace_every_path_is_white_or_cut_off(name, backend):
@@ -155,7 +154,6 @@ CAVITIES = {
 }
 
 
-@pytest.mark.alike
 @pytest.mark.parametrize("extents", [0.0, 1e5])
 @pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
 @pytest.mark.parametrize("name", CAVITIES)
