@@ -9,6 +9,7 @@ from PIL import Image
 
 import illumgrid as ig
 from illumgrid.errors import BadInput
+from illumgrid.field.filters import smooth
 from illumgrid.field.lights import Sky
 from illumgrid.field.scene import Scene
 from illumgrid.field.upright import axes_of, up_of
@@ -111,16 +112,16 @@ def test_roll_turns_the_picture_clockwise():
         assert turned[name][1] - 49.5 == pytest.approx(x, abs=3)
 
 
-def bust(upright, direction=None, origin=(0, 0, 0)):
-    """A head on a neck that is cut flat; its file states an orientation or not."""
+def bust(upright, direction=None, origin=(0, 0, 0), n=41):
+    """A head on a neck that is cut flat, of n³ voxels; its file states an orientation or not."""
     up = 1 if upright else -1
 
     def height(x):
-        p = (x - 20) * [1, 1, up]
+        p = (x * 40 / (n - 1) - 20) * [1, 1, up]
         head, neck = 13 - np.linalg.norm(p - [0, 0, 2], axis=1), 9 - np.hypot(p[:, 0], p[:, 1]) - 9 * (p[:, 2] > 0)
         return np.where(p[:, 2] > -17, np.maximum(head, neck), -20)
 
-    values = np.clip(sampled(height, (41, 41, 41)).values, -2, 2)
+    values = np.clip(sampled(height, (n, n, n)).values, -2, 2)
     return Scene.sky(
         ig.Volume(values, origin, direction=np.eye(3) if direction is None else direction), range=(0.5, 1.5)
     )
@@ -132,6 +133,24 @@ def test_what_would_stand_on_its_head_is_turned_over_unless_its_file_says_which_
     floor = bust(False).fields[0].volume
     assert up_of(Scene.floor(floor, range=(0.5, 1.5))) == "z"
     assert up_of(sky()) == up_of(Scene.sky(ball(shape=(9, 9, 9), origin=(0, 0, 0), spacing=(1, 1, 1)))) == "z"
+
+
+def test_a_part_of_a_file_that_states_no_orientation_has_none_either(tmp_path):
+    values = bust(False, n=121).fields[0].volume.values
+    np.save(tmp_path / "bust.npy", values)
+    np.savez(tmp_path / "placed.npz", values=values, origin=(0, 0, 1))
+    parts = {"downsample": 3}, {"crop": (1, 120, 1, 120, 0, 120)}, {"spacing": (1, 1, 2), "downsample": 2}
+    for part in parts:
+        volume = ig.read_volume(tmp_path / "bust.npy", **part)
+        assert volume.origin.any() and up_of(Scene.sky(smooth(volume, 0.5), range=(0.5, 1.5))) == "-z"
+        assert up_of(Scene.sky(ig.read_volume(tmp_path / "placed.npz", **part), range=(0.5, 1.5))) == "z"
+
+
+def test_a_folder_keeps_that_its_file_states_no_orientation(tmp_path):
+    np.save(tmp_path / "bust.npy", bust(False, n=81).fields[0].volume.values)
+    scene = Scene.sky(ig.read_volume(tmp_path / "bust.npy", downsample=2), range=(0.5, 1.5))
+    ig.run(scene, grid=5, paths=1, bounces=0).save(tmp_path / "out", preview=False)
+    assert up_of(ig.load(tmp_path / "out").scene) == "-z"
 
 
 # Cameras and strips

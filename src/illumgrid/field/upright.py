@@ -32,19 +32,19 @@ def axes_of(direction: Floats, up: str = "z") -> tuple[Floats, Floats, Floats]:
     return np.cross(upward_axis, front), front, upward_axis
 
 
-FLAT, ROUND = 0.3, 0.05  # area of an end over the largest section: a flat cut, a rounded end
+FLAT, ROUND = 0.3, 0.05  # area near an end over the largest section, from which it is a flat cut, to which rounded
+BLUNT = 12.0  # over the number of sections: the share that the second one of a rounded end may have; of a ball, 6 to 8
 
 
 def up_of(scene: Scene) -> str:
     """The default up: world +z, or -z for an object that would stand on its head.
 
-    Only an array without orientation (identity axes at the origin: its file states none) in a scene without walls is
-    turned over, and only if the object, as Otsu's threshold finds it, ends in a flat cut on top and is rounded below: a
-    bust stands on its neck.
+    Only an array without orientation (`Volume.oriented`: its file states none) in a scene without walls is turned over,
+    and only if the object, as Otsu's threshold finds it, ends in a flat cut on top and is rounded below: a bust stands
+    on its neck.
     """
     first = scene.fields[0]
-    stated = (first.volume.direction != np.eye(3)).any() or first.volume.origin.any()
-    if stated or scene.quads or len(scene.fields) > 1:
+    if first.volume.oriented or scene.quads or len(scene.fields) > 1:
         return "z"
     try:
         level = first.volume.to_stored(otsu_threshold(first.volume, first.inside))
@@ -52,8 +52,12 @@ def up_of(scene: Scene) -> str:
         return "z"
     values = first.volume.stored
     areas = sum(np.count_nonzero(first.solid(values[slab], level), axis=(0, 1)) for slab in slabs(values.shape))
-    ends = areas[areas > 0][[0, -1]] / areas.max()
-    return "-z" if ends[1] > FLAT and ends[0] < ROUND else "z"
+    there = areas[areas > 0]
+    if len(there) < 4:
+        return "z"
+    below, above = there[[1, -2]] / there.max()  # the first and the last may be cut, or be means with empty slices
+    rounded = max(ROUND, BLUNT / len(there))
+    return "-z" if below < rounded and above > max(FLAT, 1.25 * rounded) else "z"
 
 
 def sky_axes(scene: Scene) -> Floats:

@@ -4,7 +4,7 @@ Between voxels a volume is trilinear. Every level set in this package is a level
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Literal, Protocol
 
@@ -75,6 +75,11 @@ def placement(origin: ArrayLike, spacing: ArrayLike, direction: ArrayLike) -> tu
     return at, step, axes if np.abs(axes @ axes.T - np.eye(3)).max() < 1e-14 else nearest
 
 
+def states_place(origin: Floats, direction: Floats) -> bool:
+    """Whether a file states a place or an orientation: without one, readers take identity axes at the origin."""
+    return bool(origin.any() or (direction != np.eye(3)).any())
+
+
 AT_ONCE = 1 << 22
 """Voxels that are looked at together: bounds the memory."""
 
@@ -111,6 +116,9 @@ class Volume:
         Of the world coordinates, such as "mm" or "µm".
     stored : array_like, optional
         In place of `values`, and the same: so that ``dataclasses.replace`` can change the rest.
+    oriented : bool, optional
+        Whether origin and direction say which way is up; by default, unless both are those of a file that states none:
+        identity axes at the world's origin. A part of such a file lies elsewhere and is no better oriented.
 
     Attributes
     ----------
@@ -135,6 +143,7 @@ class Volume:
     slope: float
     intercept: float
     unit: str | None
+    oriented: bool
 
     def __init__(
         self,
@@ -147,6 +156,7 @@ class Volume:
         unit: str | None = None,
         *,
         stored: NDArray[Any] | None = None,
+        oriented: bool | None = None,
     ) -> None:
         if (values is None) == (stored is None):
             raise BadInput("values and `stored` came both or not at all; expected one of them: give values alone")
@@ -166,8 +176,10 @@ class Volume:
         places = placement(origin, spacing, direction)
         for place in places:
             place.setflags(write=False)
-        names = ("stored", "slope", "intercept", "unit", "origin", "spacing", "direction")
-        for name, value in zip(names, (kept, slope, intercept, unit, *places)):
+        if oriented is None:
+            oriented = states_place(places[0], places[2])
+        names = ("stored", "slope", "intercept", "unit", "oriented", "origin", "spacing", "direction")
+        for name, value in zip(names, (kept, slope, intercept, unit, oriented, *places)):
             object.__setattr__(self, name, value)
         if not (self.plain or np.isfinite(self.extremes).all()):
             raise BadInput(
@@ -248,7 +260,7 @@ class Volume:
 
     def with_stored(self, stored: NDArray[Any]) -> "Volume":
         """Other stored values on the same lattice, with the same map."""
-        return Volume(stored, self.origin, self.spacing, self.direction, self.slope, self.intercept, self.unit)
+        return replace(self, stored=stored)
 
 
 def histogram(volume: Volume, bins: int, ends: tuple[float, float] | None = None) -> tuple[NDArray[np.int64], Floats]:

@@ -51,7 +51,7 @@ class Source:
         volume = read_volume(self.path, **self.reading)
         if folded:
             place = volume.origin, volume.spacing, volume.direction
-            volume = Volume(volume.values.astype(float), *place, unit=volume.unit)
+            volume = Volume(volume.values.astype(float), *place, unit=volume.unit, oriented=volume.oriented)
         volume = without_gaps(volume) if self.side is None else finite(volume, self.side)
         return {None: smooth(volume, self.blur)}
 

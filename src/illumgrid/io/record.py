@@ -72,6 +72,7 @@ def record_of(stored: Stored) -> Record:
     fields = [
         {"name": f.name, "range": f.range.tolist(), "inside": f.inside, "falling": f.falling}
         | {"slope": f.volume.slope, "intercept": f.volume.intercept, "unit": f.volume.unit}
+        | ({} if f.volume.oriented else {"oriented": False})
         | {"albedo": f.material.albedo.tolist(), "emission": f.material.emission.tolist()}
         | {n: getattr(f.material, n) for n in LOOKS if getattr(f.material, n)}
         | ({} if f.material.roughness is None else {"roughness": f.material.roughness})
@@ -146,7 +147,8 @@ def _field_volume(record: Record, about: Record, plan: Plan, parts: exr.Parts) -
     values = exr.field_values(image, inside) if inside.field else exr.array(image, "Y", inside.shape)
     origin, spacing, direction = (about[k] for k in PLACE)
     slope, intercept = about.get("slope", 1.0), about.get("intercept", 0.0)
-    return Volume(values, origin, spacing, direction, slope, intercept, about.get("unit"))
+    oriented = False if about.get("oriented") is False else None  # older folders say it by their place alone
+    return Volume(values, origin, spacing, direction, slope, intercept, about.get("unit"), oriented=oriented)
 
 
 def rebuild(record: Record, plan: Plan, parts: exr.Parts, volumes: list[Volume] | None) -> Stored:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from illumgrid.errors import BadInput
 from illumgrid.field.storing import NATIVE
-from illumgrid.field.volume import Floats, Volume
+from illumgrid.field.volume import Floats, Volume, states_place
 from illumgrid.io.readers.limits import AS_FLOAT, check_axes, check_memory
 from illumgrid.io.readers.paged import resident, settled
 from illumgrid.io.readers.windows import Span, take
@@ -73,6 +73,8 @@ class Stored:
     """(3,) voxels in the file, where `values` are only the part of them that is wanted, and `origin` is that of all."""
     start: Floats | None = None
     """(3,) origin in voxels, where the file has it so: with another spacing it is elsewhere."""
+    oriented: bool | None = None
+    """Of a part, whether the file states where the whole lies."""
 
 
 def following(count: int) -> tuple[Note, ...]:
@@ -113,6 +115,8 @@ def part(stored: Stored, wanted: Wanted) -> Stored:
     spans = wanted.spans(stored.whole or stored.values.shape)
     values = take(stored.values, spans) if stored.whole is None else stored.values
     first, factor = np.array([span.first + (span.block - 1) / 2 for span in spans]), spans[0].block
+    lengths = np.linalg.norm(stored.steps, axis=0)
+    stated = states_place(stored.origin, stored.steps / np.where(lengths > 0, lengths, 1.0))
     return replace(
         stored,
         values=values,
@@ -120,6 +124,7 @@ def part(stored: Stored, wanted: Wanted) -> Stored:
         steps=stored.steps * factor,
         spacing=None if stored.spacing is None else stored.spacing * factor,
         whole=None,
+        oriented=stated if stored.oriented is None else stored.oriented,
     )
 
 
@@ -171,9 +176,8 @@ def place(stored: Stored) -> tuple[Volume, tuple[Note, ...]]:
     small = values.dtype.newbyteorder("=") in NATIVE
     check_memory(resident(values.nbytes) if small else values.size * (8 + AS_FLOAT))
     values = settled(values) if small else values
-    volume = Volume(
-        values, stored.origin, spacing, exact, slope=stored.slope, intercept=stored.intercept, unit=stored.unit
-    )
+    units = stored.slope, stored.intercept, stored.unit
+    volume = Volume(values, stored.origin, spacing, exact, *units, oriented=stored.oriented)
     return volume, notes
 
 
