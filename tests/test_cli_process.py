@@ -43,6 +43,12 @@ def test_the_module_runs_as_the_command_does(tmp_path):
     assert done.stderr.count("\n") == 1 and not list(tmp_path.iterdir())
 
 
+def test_closed_streams_are_no_trouble(folder):
+    line = "{0} info v.npy >&- && {0} --version <&- >&- 2>&-".format(f"{sys.executable} -m illumgrid")
+    done = subprocess.run(line, shell=True, capture_output=True, text=True, cwd=folder)
+    assert done.returncode == 0 and "Traceback" not in done.stderr and not done.stdout
+
+
 def test_help_is_quick_because_it_loads_nothing_heavy():
     code = """
 import sys

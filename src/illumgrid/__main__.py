@@ -9,6 +9,9 @@ from types import FrameType
 
 def main() -> None:
     """Import the command line and run it; Ctrl-C, SIGTERM and SIGHUP end it without a traceback wherever it is."""
+    for stream, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, stream) is None:  # closed, as by >&-: the next file would take its number
+            setattr(sys, stream, open(os.devnull, mode, encoding="utf-8"))  # noqa: SIM115
     came = []
 
     def stop(number: int, frame: FrameType | None) -> None:
