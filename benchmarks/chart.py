@@ -37,8 +37,9 @@ from illumgrid.accuracy.chart.race import SEEDS, Race, front
 from illumgrid.accuracy.choose import planned
 from illumgrid.accuracy.judge import judge
 from illumgrid.accuracy.points import unseen_in_volume, unseen_on_level_sets
-from illumgrid.accuracy.reference import begin, converge, errors, look_up
+from illumgrid.accuracy.reference import begin, converge, errors
 from illumgrid.bake.accumulator import Bake
+from illumgrid.bake.around import look_up
 from illumgrid.cli.report import files
 from illumgrid.field.filters import smooth
 from illumgrid.field.scene import level_table
@@ -219,7 +220,11 @@ def judgements(asked):
     light = run(scene, grid=40, paths=128, bounces=8, seed=0, judge=False)
     exact = converge(begin(tracer, unseen_in_volume(scene, 2000, 50), 32, 50), 0.02, 256)
     about = light.recipe["queries"], 128, 8
-    reported = [judge(scene, tracer, light.grids, seed, *about) for seed in range(12)]
+
+    def held(asked):
+        return look_up(light.grids, asked)[0]
+
+    reported = [judge(scene, tracer, unseen_in_volume, held, seed, *about) for seed in range(12)]
     rmse, true = [e.rmse for e in reported], off(light, exact).rmse
     uncertain = [e.uncertain for e in reported]
     print(f"  error {true:.2%}; reported {min(rmse):.2%} to {max(rmse):.2%}, {np.mean(rmse):.2%} on average, spread "

@@ -48,7 +48,8 @@ def fields(folder):
 
 def measured(grid, reference):
     """What is off, and the coverage of the bars, in words."""
-    from illumgrid.accuracy.reference import errors, look_up
+    from illumgrid.accuracy.reference import errors
+    from illumgrid.bake.around import look_up
 
     points = reference.queries.point
     e = errors(look_up([grid], reference.queries)[0], reference)

@@ -15,7 +15,8 @@ import numpy as np
 
 import illumgrid as ig
 from illumgrid.accuracy.points import unseen_on_level_sets
-from illumgrid.accuracy.reference import begin, converge, errors, look_up
+from illumgrid.accuracy.reference import begin, converge, errors
+from illumgrid.bake.around import look_up
 from illumgrid.field.scene import Material, Scene
 from illumgrid.field.volume import Volume
 from illumgrid.transport.samples import join_queries

@@ -4,15 +4,15 @@ import numpy as np
 import pytest
 
 from illumgrid import run
-from illumgrid.accuracy.around import lattice
 from illumgrid.accuracy.choose import Goal, Plan, choose, outlook, planned, sizes
-from illumgrid.accuracy.cost import Pace
 from illumgrid.accuracy.judge import judge
 from illumgrid.accuracy.points import other_paths, unseen_in_volume, unseen_on_level_sets
 from illumgrid.accuracy.probe import Measured, Probe
-from illumgrid.accuracy.reference import Parts, Reference, begin, converge, errors, look_up, parts_of
+from illumgrid.accuracy.reference import Parts, Reference, begin, converge, errors, parts_of
 from illumgrid.backends.numba_ import Numba
 from illumgrid.bake.accumulator import Bake
+from illumgrid.bake.ahead import lattice, nodes_to_light
+from illumgrid.bake.around import look_up
 from illumgrid.chain import rounds
 from illumgrid.field.lattice import specs_over
 from illumgrid.field.scene import Scene, level_table
@@ -105,9 +105,10 @@ def test_corners_hold_exactly_what_a_lookup_in_the_built_grid_reads():
     asked = unseen_in_volume(scene, 300, 0)
     for nodes in (9, 22, 31):
         light = run(scene, grid=nodes, paths=8, bounces=2, seed=5)
-        around = corners(scene, specs_over(scene, nodes), asked)
+        ahead = lattice(specs_over(scene, nodes), prepare(BACKEND, scene), 2)
+        around = corners(scene, ahead.specs, asked)
         read, covered = around.read(BACKEND.solve(scene, around.asked, paths=range(8), bounces=2, seed=5))
-        assert covered.mean() > 0.5 and around.nodes == light.recipe["queries"]
+        assert covered.mean() > 0.5 and nodes_to_light(scene, ahead) == light.recipe["queries"]
         np.testing.assert_allclose(read[covered], look_up(light.grids, asked)[0][covered], rtol=2e-5)
 
 
@@ -150,25 +151,22 @@ def test_the_measured_noise_is_that_of_two_built_grids():
     assert found.parts.noise == pytest.approx(built, rel=0.25)
 
 
-def measured(grid, floor, noise=0.04, paths=16, nodes=None):
+def measured(grid, floor, noise=0.04, paths=16, nodes=None, slow=1.0):
     parts = Parts(noise=noise**2, grid=floor**2, uncovered=0, bounces=0, cross=0, uncertain=0)
-    return Measured(grid, nodes or grid**3, parts, paths)
-
-
-PACE = Pace(1e-5, 1e-6)
+    return Measured(grid, nodes or grid**3, parts, paths, node=slow * 1e-5, path=slow * 1e-6)
 
 
 def test_the_least_time_for_an_error_and_the_least_error_for_a_time():
     tried = [measured(10, 0.05), measured(20, 0.02), measured(40, 0.005)]
     for goal in (0.01, 0.03, 0.06):
-        choice = choose(tried, PACE, Goal(goal))
+        choice = choose(tried, Goal(goal))
         assert choice.met and choice.error == pytest.approx(goal, rel=0.1)
-        others = [PACE.seconds(m.nodes, n) for m in tried if (n := m.paths_for(goal**2))]
+        others = [m.seconds(m.nodes, n) for m in tried if (n := m.paths_for(goal**2))]
         assert choice.seconds == min(others)
     for seconds in (0.05, 0.5, 5.0):
-        choice = choose(tried, PACE, Goal(seconds=seconds))
+        choice = choose(tried, Goal(seconds=seconds))
         assert choice.met and choice.seconds <= seconds * 1.001
-        counts = [PACE.paths_in(seconds, m.nodes) for m in tried]
+        counts = [m.paths_in(seconds, m.nodes) for m in tried]
         assert choice.error == min(m.squared(n) ** 0.5 for m, n in zip(tried, counts) if n >= 4)
 
 
@@ -223,10 +221,10 @@ def test_the_probe_of_an_error_climbs_to_finer_grids_where_its_first_choice_will
 
 
 def test_what_cannot_be_had_is_said():
-    choice = choose([measured(10, 0.05), measured(20, 0.02)], PACE, Goal(0.01))
+    choice = choose([measured(10, 0.05), measured(20, 0.02)], Goal(0.01))
     assert not choice.met and choice.measured.grid == 20 and choice.error == pytest.approx(0.02 * 1.25**0.5, rel=0.05)
-    assert not choose([measured(40, 0.005)], PACE, Goal(seconds=1e-3)).met
-    fixed = choose([measured(20, 0.02)], PACE, Goal(0.03, paths=7))
+    assert not choose([measured(40, 0.005)], Goal(seconds=1e-3)).met
+    fixed = choose([measured(20, 0.02)], Goal(0.03, paths=7))
     assert fixed.paths == 7 and not fixed.met
 
 
@@ -234,23 +232,23 @@ def test_a_plan_that_is_crude_late_or_out_of_reach_is_announced():
     tried = [measured(20, 0.02), measured(40, 0.005)]
 
     def said(goal, pilot=0.0):
-        return outlook(tried, PACE, goal, choose(tried, PACE, goal), pilot)
+        return outlook(tried, goal, choose(tried, goal), pilot)
 
-    easy = choose(tried, PACE, Goal(0.05)).seconds
+    easy = choose(tried, Goal(0.05)).seconds
     assert said(Goal(0.05)) == "" and said(Goal(seconds=10 * easy)) == ""
     short = said(Goal(seconds=1e-3))
     assert "0.001 seconds are too short" in short and "10% takes about 0.11 seconds" in short
     assert "10% takes about 2.1 seconds" in said(Goal(seconds=1e-3), pilot=2.0)  # which --seconds counts, too
     assert "out of reach" in said(Goal(1e-4))
-    times = 100 / choose(tried, PACE, Goal(0.021)).seconds
-    slow = Pace(times * PACE.node, times * PACE.path)
-    late = outlook(tried, slow, Goal(0.021), choose(tried, slow, Goal(0.021)), 0.0)
+    times = 100 / choose(tried, Goal(0.021)).seconds
+    slow = [measured(20, 0.02, slow=times), measured(40, 0.005, slow=times)]
+    late = outlook(slow, Goal(0.021), choose(slow, Goal(0.021)), 0.0)
     assert "2.1% is predicted to take" in late and "--seconds 60 reaches" in late
 
 
 def test_walls_take_their_time():
     tried = [measured(20, 0.02)]
-    without, beside = (choose(tried, PACE, Goal(seconds=1.0, texels=texels)) for texels in (0, 20**3))
+    without, beside = (choose(tried, Goal(seconds=1.0, texels=texels)) for texels in (0, 20**3))
     assert beside.paths < 0.6 * without.paths
 
 
@@ -265,7 +263,7 @@ def test_the_judgement_agrees_with_a_reference_on_level_sets():
     asked = unseen_on_level_sets(scene, 16, 1600, seed=50)
     truth = converge(begin(tracer, asked, 16, seed=50), 0.01, 128)
     light = run(scene, grid=14, paths=16, seed=0)
-    found = judge(scene, tracer, light.grids, 0, 10**7, 16, 4)
+    found = judge(scene, tracer, unseen_in_volume, lambda asked: look_up(light.grids, asked)[0], 0, 10**7, 16, 4)
     assert found.rmse == pytest.approx(off(light, truth), rel=0.2)
     assert 0 < found.uncertain < 0.2 * found.rmse
 

@@ -16,16 +16,16 @@ import pytest
 
 from illumgrid import registry, run
 from illumgrid.accuracy import chart as benches
-from illumgrid.accuracy import cost, reference
+from illumgrid.accuracy import probe, reference
 from illumgrid.accuracy.chart import _references, _remarks, _show_default, _thinned, _tracer_of, bench, contestants
 from illumgrid.accuracy.chart import race as races
 from illumgrid.accuracy.chart import sizes as sizes_of
 from illumgrid.accuracy.chart.contestants import COUNTS, Method, methods, tracers
 from illumgrid.accuracy.chart.race import Point, Race, Run, front
-from illumgrid.accuracy.cost import Pace
 from illumgrid.accuracy.points import unseen_on_level_sets
-from illumgrid.accuracy.reference import begin, errors, look_up
+from illumgrid.accuracy.reference import begin, errors
 from illumgrid.backends.numba_ import Numba
+from illumgrid.bake.around import look_up
 from illumgrid.cli import report
 from illumgrid.cli.report import table
 from illumgrid.field.lattice import specs_over
@@ -202,9 +202,8 @@ def test_a_budget_or_a_scene_that_cannot_be_is_refused():
 def ticking(monkeypatch):
     """A clock that goes on by a fixed step whenever it is read: no machine is too slow for a budget."""
     ticks = itertools.count(step=0.1)
-    for module in (benches, cost, contestants, races, reference):
+    for module in (benches, contestants, probe, races, reference):
         monkeypatch.setattr(module, "time", SimpleNamespace(perf_counter=lambda: next(ticks)))
-    monkeypatch.setattr(cost, "timeit", SimpleNamespace(repeat=lambda work, **_: [work() and 0.1]))
 
 
 def test_bench_writes_what_it_says_whole_and_once(call, tmp_path, ticking):
@@ -265,9 +264,9 @@ def test_run_says_what_would_help_noisy_data(call, tmp_path):
 def test_what_is_foreseen_of_a_grid_is_what_the_grid_will_hold(truth):
     scene, exact = truth
     race = Race(scene, {"levelset": exact}, [METHOD], [9, 21], 3, 5)
-    race.predict(METHOD, Nearest(), 21, 8, 12.5, default=True)
+    race.predict(METHOD, Nearest(), 21, 8, default=True)
     (seen,) = race.points
-    assert seen.default and not seen.built and seen.seconds == [12.5] * 3 and seen.paths == 8
+    assert seen.default and not seen.built and seen.seconds == [seen.time] * 3 and seen.time > 0 and seen.paths == 8
     asked = exact.queries
     for seed, light in zip((5, 6, 7), seen.light):
         run = Run(scene, METHOD, 21, 3, seed)
@@ -310,21 +309,20 @@ def test_it_reports_where_runs_default_stands(truth):
     assert "run's default (about 15 s, error 20.00%) is on the front" in report.advice(records, PARTS, 5)
 
 
-def test_a_default_that_is_too_costly_is_foreseen_and_so_are_its_neighbours(truth, monkeypatch):
+def test_a_default_that_is_too_costly_is_foreseen_and_so_are_its_neighbours(truth):
     scene, exact = truth
     race = Race(scene, {"levelset": exact}, [METHOD], [5, 11, 22], 3, 0)
-    said = _show_default(race, 11, 32, 1e-6)
+    said = _show_default(race, 11, 32, 1e-6, 1e-6)
     assert "~" in said[0] and [(p.grid, p.paths, p.built) for p in race.points] == [(11, 32, False)]
-    with monkeypatch.context() as patch:  # a second a path: there is time for three seeds of 8 paths, not of 32
-        patch.setattr("illumgrid.accuracy.chart.measure_pace", lambda *_: Pace(0.0, 1.0))
-        race = Race(scene, {"levelset": exact}, [METHOD], [5, 11, 22], 3, 0)
-        _show_default(race, 22, 32, (3 * 8 * 8 * len(exact) + 1000) / 0.15)
+    # A second a path: there is time for three seeds of 8 paths, not of 32.
+    race = Race(scene, {"levelset": exact}, [METHOD], [5, 11, 22], 3, 0)
+    _show_default(race, 22, 32, (3 * 8 * 8 * len(exact) + 1000) / 0.15, 1.0)
     assert {(p.grid, p.paths, p.default) for p in race.points} == {(22, 32, True), (11, 8, False), (22, 8, False)}
     assert not any(p.built for p in race.points)
     shown = {(p.grid, p.paths): p for p in race.points}
-    assert shown[22, 32].time == 4 * shown[22, 8].time == 32 * shown[22, 8].queries
+    assert shown[22, 32].time > shown[22, 8].time and shown[22, 8].queries > 4 * shown[11, 8].queries
     race = Race(scene, {"levelset": exact}, [METHOD], [5, 11, 22], 3, 0)
-    assert not _show_default(race, 11, 32, 1e6)
+    assert not _show_default(race, 11, 32, 1e6, 1e-6)
     assert [(p.grid, p.paths, p.built) for p in race.points] == [(11, 32, True)]
 
 
@@ -338,7 +336,7 @@ def test_runs_default_under_a_sky_races_with_its_first_look_and_its_command_line
         return Race(scene, {"levelset": exact}, [way], [6], 3, 5)
 
     shown = race()
-    assert not _show_default(shown, None, None, 1e6)
+    assert not _show_default(shown, None, None, 1e6, 1e-6)
     (default,) = shown.points
     assert default.default and default.built and default.method.looked
     own = run(scene, isovalues=2, seed=5, judge=False)
@@ -355,11 +353,11 @@ def test_runs_default_under_a_sky_races_with_its_first_look_and_its_command_line
     assert "nearest was" not in str(report.advice([record | {"rmse": 0.001}], PARTS, 3))
     assert "dominated" not in str(report.advice([record | {"rmse": 0.2}], PARTS, 3))
     predicted, without = race(), race()
-    predicted.predict(default.method, default.interpolator, None, None, None, default=True)
+    predicted.predict(default.method, default.interpolator, None, None, default=True)
     (seen,) = predicted.points
     assert seen.default and not seen.built and seen.queries == default.queries
     np.testing.assert_allclose(seen.light[0], default.light[0], rtol=1e-4)
-    assert "does not compete" in _show_default(without, None, None, 1e-9)[0] and not without.points
+    assert "does not compete" in _show_default(without, None, None, 1e-9, 1e-6)[0] and not without.points
 
 
 def test_runs_default_for_noisy_data_in_the_studio_is_read_by_level_and_normal():
@@ -374,7 +372,7 @@ def test_runs_default_for_noisy_data_in_the_studio_is_read_by_level_and_normal()
     expected = look_up(own.grids, exact.queries)[0]
     for budget in (1e6, 1e-9):
         race = Race(scene, {"levelset": exact}, [way], [6], 3, 5)
-        _show_default(race, None, None, budget)
+        _show_default(race, None, None, budget, 1e-6)
         (default,) = race.points
         assert own.recipe["by_normal"] and default.default and default.built == (budget > 1)
         assert (default.paths, default.queries) == (own.recipe["paths"], own.recipe["queries"]) and default.time > 0
@@ -458,7 +456,7 @@ def test_of_fields_of_different_size_the_marked_setting_lights_the_nodes_of_each
     nodes = sum(len(reachable(field, spec)) for field, spec in zip(fields, specs))
     for budget in (1e6, 1e-6):  # built, and predicted
         race.points = []
-        _show_default(race, None, 4, budget)
+        _show_default(race, None, 4, budget, 1e-6)
         assert [p.default for p in race.points] == [True]
         assert race.points[0].queries == nodes and race.points[0].longest == 14
     assert [max(spec.shape) for spec in specs] == [14, 7]

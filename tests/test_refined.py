@@ -10,13 +10,14 @@ import pytest
 import illumgrid as ig
 from illumgrid import unfinished
 from illumgrid.accuracy import choose
-from illumgrid.accuracy.around import around, filled, looked
 from illumgrid.accuracy.points import unseen_in_volume
 from illumgrid.accuracy.probe import Probe
-from illumgrid.accuracy.reference import look_up
 from illumgrid.backends.numba_ import Numba
 from illumgrid.bake.accumulator import Bake
+from illumgrid.bake.ahead import looked, nodes_to_light
+from illumgrid.bake.around import around, look_up
 from illumgrid.bake.refined import MOST, PATH_COUNTS, SHARED, Chosen, Seen, chosen, read_choice, written
+from illumgrid.bake.targets import filled
 from illumgrid.field.volume import interpolate, world_to_index
 from illumgrid.grid import GridSpec, IlluminationGrid, Nodes
 from illumgrid.grid.nested import coarser, finer, spread, within
@@ -257,21 +258,22 @@ def test_the_nodes_around_points_hold_what_a_whole_run_has_there():
     ahead = looked(scene, prepare(Numba(), scene), 17, None, 3)
     asked = unseen_in_volume(scene, 12, 5)
     near = around(scene, ahead, asked)
-    assert ahead.refined["levels"] and len(near.asked) < 0.6 * near.nodes == 0.6 * len(ahead.sampler.nodes[0])
+    assert ahead.refined["levels"] and len(near.asked) < 0.6 * nodes_to_light(scene, ahead)
     every = list(ahead.sampler.queries(scene, ahead.specs, 3))
-    grids = filled(scene, ahead, Bake.of(every, ahead.bounces, 3).walk(ahead.tracer, range(4)).answers)
+    answers = Bake.of(every, ahead.bounces, 3).walk(ahead.tracer, range(4)).answers
+    grids = list(filled(scene, ahead.specs, ahead.interpolator, answers))
     light, whole = near.read(Bake.of([near.asked], ahead.bounces, 3).walk(ahead.tracer, range(4)).samples)
     expected, covered = look_up(grids, asked)
     assert whole.all() and covered.all()
     np.testing.assert_allclose(light, expected, rtol=1e-5)
 
 
-def test_an_error_or_a_time_under_a_sky_may_be_reached_by_a_first_look(monkeypatch):
+def test_an_error_or_a_time_under_a_sky_is_reached_by_a_first_look(monkeypatch):
     scene, real = sky(shell(25), (0.2, 0.8)), Probe.measure
 
     def coarse(probe, ahead, *how):
         found = real(probe, ahead, *how)
-        return found if found.looked else replace(found, parts=replace(found.parts, grid=1.0))
+        return found if ahead.refined else replace(found, parts=replace(found.parts, grid=1.0))
 
     monkeypatch.setattr(Probe, "measure", coarse)  # no lattice will do
     met = ig.run(scene, error=0.05, isovalues=2, seed=1, judge=True).recipe
@@ -282,6 +284,6 @@ def test_an_error_or_a_time_under_a_sky_may_be_reached_by_a_first_look(monkeypat
     assert given["refined"] is None and not given["plan"]["looked"]  # nodes that are given are lit as a whole
     own = ig.run(scene, error=0.08, bounces=3, isovalues=2, seed=1, judge=False).recipe
     assert own["refined"] and own["bounces"] == 3 and not own["cache"]
-    monkeypatch.setattr(choose.Search, "_too_late", lambda *_: True)
     with pytest.warns(ig.IllumgridWarning, match="too short"):
-        assert ig.run(scene, seconds=1e-6, isovalues=2, judge=False).recipe["refined"] is None
+        short = ig.run(scene, seconds=1e-6, isovalues=2, judge=False).recipe
+    assert short["refined"]["from"] == choose.sizes(scene)[0] and short["paths"] == 4  # as little as there is

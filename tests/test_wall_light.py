@@ -1,10 +1,12 @@
 """Light of walls follows the scene: square texels in a number that suits it, calm where it is smooth, and judged."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 
 import illumgrid as ig
-from illumgrid.accuracy.judge import judge_walls
+from illumgrid.accuracy.judge import judge
 from illumgrid.accuracy.points import unseen_on_walls
 from illumgrid.backends.numba_ import Numba
 from illumgrid.bake.walls import look_up_walls, place_on_walls, wall_queries
@@ -85,12 +87,15 @@ def test_the_error_of_walls_is_that_of_their_light():
     tracer = prepare(Numba(), scene)
     light = ig.run(scene, grid=8, paths=64, bounces=3, isovalues=4)
     texels = sum(wall.support.size for wall in light.walls)
-    measured = judge_walls(scene, tracer, light.walls, 0, texels, 64, 3)
     brighter = [WallTexture(1.5 * wall.light, wall.support, wall.channels) for wall in light.walls]
-    off = judge_walls(scene, tracer, brighter, 0, texels, 64, 3)
+    measured, off = (
+        judge(scene, tracer, unseen_on_walls, partial(look_up_walls, scene, walls), 0, texels, 64, 3)
+        for walls in (light.walls, brighter)
+    )
     assert off.bias == pytest.approx(1.5 * (1 + measured.bias) - 1, abs=1e-4)  # the same points, by the same paths
     assert 0 < measured.rmse < off.rmse and measured.rmse < 0.25
-    assert judge_walls(sky(), prepare(Numba(), sky()), (), 0, 0, 64, 3) is None
+    none = partial(look_up_walls, sky(), ())
+    assert judge(sky(), prepare(Numba(), sky()), unseen_on_walls, none, 0, 0, 64, 3) is None
 
 
 # Noise

@@ -5,6 +5,7 @@ import os
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, replace
+from functools import partial
 from importlib.metadata import version
 from typing import Any
 
@@ -13,15 +14,18 @@ import numpy as np
 from illumgrid import registry
 from illumgrid.accuracy.choose import JUDGED, planned
 from illumgrid.accuracy.judge import judge as measure_error
-from illumgrid.accuracy.judge import judge_walls as measure_walls
+from illumgrid.accuracy.points import unseen_in_volume, unseen_on_walls
 from illumgrid.accuracy.probe import FEWEST_PATHS, MOST_PATHS
+from illumgrid.accuracy.reference import Errors
 from illumgrid.bake import Baked, bake
 from illumgrid.bake.accumulator import Map, Progress
 from illumgrid.bake.ahead import BY_NORMAL, Ahead, by_normal_in, light_ahead, refinable_by
+from illumgrid.bake.around import look_up
 from illumgrid.bake.bounces import enough_bounces, has_long_paths, light_left_out
+from illumgrid.bake.walls import look_up_walls
 from illumgrid.constants import BASE, PATHS
 from illumgrid.errors import BadInput, tell, tell_after
-from illumgrid.field.lattice import specs_over
+from illumgrid.field.lattice import along_longest, specs_over
 from illumgrid.field.layers import layers_of
 from illumgrid.field.scene import Levels, Scene, finer_texels, level_table, with_texels
 from illumgrid.grid import GridSpec
@@ -203,10 +207,6 @@ def run(
     return judged(light, chosen[1], tracer) if judge else light
 
 
-def _longest(specs: Sequence[GridSpec]) -> int:
-    return max(max(spec.shape) for spec in specs)
-
-
 def _planned(
     scene: Scene, tracer: Tracer, levels: Levels, progress: Progress, **asked: Any
 ) -> tuple[dict[str, Any], Ahead | None]:
@@ -277,9 +277,9 @@ def _chosen(stages: Sequence[Any], ahead: Ahead, looked_at: Sequence[GridSpec]) 
     kinds = zip(("sampler", "backend", "interpolator"), (*stages[:2], ahead.interpolator))
     return {
         **{kind: _described(stage) for kind, stage in kinds},
-        "grid": _longest(ahead.specs),
+        "grid": along_longest(ahead.specs),
         "cache": ahead.cached,
-        "refined": ahead.refined and {"from": _longest(looked_at), "levels": ahead.refined["levels"]},
+        "refined": ahead.refined and {"from": along_longest(looked_at), "levels": ahead.levels},
     }
 
 
@@ -322,10 +322,14 @@ def judged(light: Illumination, backend: Backend, tracer: Tracer | None = None) 
         quick = registry.backend("auto")  # of the same surface
         if tracer is None or quick != backend:
             tracer = prepare(quick, light.scene)
-        about = (recipe[key] for key in ("seed", "queries", "paths", "bounces"))
-        found = measure_error(light.scene, tracer, light.grids, *about)
-        texels = (recipe[key] for key in ("seed", "texels", "texel_paths", "bounces"))
-        on_walls = measure_walls(light.scene, tracer, light.walls, *texels) if light.walls else None
+
+        def off(unseen: Any, held: Any, *work: str) -> Errors | None:
+            about = (recipe[key] for key in ("seed", *work, "bounces"))
+            return measure_error(light.scene, tracer, unseen, held, *about)
+
+        found = off(unseen_in_volume, lambda asked: look_up(light.grids, asked)[0], "queries", "paths")
+        held = partial(look_up_walls, light.scene, light.walls)
+        on_walls = off(unseen_on_walls, held, "texels", "texel_paths") if light.walls else None
     except Exception as reason:  # a finished run is worth more than its judgement
         tell_after(
             "error", f"the error reached could not be measured ({type(reason).__name__}: {reason})", stacklevel=2

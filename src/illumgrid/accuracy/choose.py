@@ -1,4 +1,4 @@
-"""No more than a scene needs: nodes, paths and bounces for an asked error or time, from a short probe."""
+"""No more than a scene needs: nodes, paths and bounces for an asked error or time, from a short pilot."""
 
 import time
 from collections.abc import Sequence
@@ -6,11 +6,9 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from illumgrid.accuracy.around import lattice, looked
-from illumgrid.accuracy.cost import Pace, measure_pace
-from illumgrid.accuracy.probe import FEWEST_PATHS, MOST_PATHS, Measured, Probe
+from illumgrid.accuracy.probe import FEWEST_PATHS, Measured, Probe
 from illumgrid.accuracy.texels import Walls, walls_for
-from illumgrid.bake.ahead import Ahead
+from illumgrid.bake.ahead import Ahead, lattice, looked
 from illumgrid.bake.bounces import enough_bounces
 from illumgrid.bake.walls import texel_paths, wall_queries
 from illumgrid.field.lattice import specs_over
@@ -19,12 +17,13 @@ from illumgrid.rng import shifted_seed
 from illumgrid.transport.tracer import Tracer
 
 SHARE = 0.25  # of the asked error that the bounces left out may be
+FOR_A_TIME = 0.02  # the error that a reference must judge where none is asked
 JUDGED = 0.95  # of the asked seconds: the rest is for the judgement at the end
 TRIAL_PATHS = 16  # from each node, with which grids are tried
 LOOKED_PATHS = 4  # the same where a first look chose the nodes
-LOOKED_COST = 100 * 12  # paths that take as long as one point there: it reads so many nodes, each of which reads others
-REFERENCE_COST = 4  # of its paths, over others: they are walked twice, with more bounces and with fewer
-SOON = 5.0  # seconds that a look at more points may take even before a shorter run
+MORE = 4  # times as many points from look to look
+IN_TIME, OF_LATTICES, OF_LOOKS = (64, 256, 1024, 4096), (384, 1536, 6144), (1536, 6144)  # points; two for an error
+SOON = 5.0  # seconds that a look at the most points may take even before a shorter run
 CRUDE, LONG = 0.1, 60.0  # relative error, and seconds, beyond which a plan is announced with an alternative
 MOST_NODES = 40_000_000  # a grid of about 2 GB with all that belongs to it
 
@@ -57,7 +56,7 @@ class Choice:
 
 @dataclass(frozen=True)
 class Plan:
-    """What the probe chose, and why."""
+    """What the pilot chose, and why."""
 
     grid: int
     paths: int
@@ -78,12 +77,11 @@ def sizes(scene: Scene) -> list[int]:
     return [max(4, round(longest * 2.0 ** (k / 2))) for k in range(-8, 3) if longest * 2.0 ** (k / 2) > 5]
 
 
-def choose(tried: Sequence[Measured], pace: Pace, goal: Goal) -> Choice:
+def choose(tried: Sequence[Measured], goal: Goal) -> Choice:
     """The least time for an error, or else the least error for a time; if neither can be had, what comes nearest."""
 
     def choice(m: Measured, count: int, met: bool) -> Choice:
-        takes = (m.pace or pace).seconds(goal.work(m.nodes), count)
-        return Choice(m, count, float(np.sqrt(m.squared(count))), takes, met)
+        return Choice(m, count, float(np.sqrt(m.squared(count))), m.seconds(goal.work(m.nodes), count), met)
 
     if goal.error is not None:
         square = goal.error**2
@@ -94,7 +92,7 @@ def choose(tried: Sequence[Measured], pace: Pace, goal: Goal) -> Choice:
         least = min(m.floor for m in tried)
         best = min((m for m in tried if m.floor <= 1.2 * least), key=lambda m: m.nodes)  # a tenth off, no more
         return choice(best, goal.paths or best.paths_for(1.25 * best.floor) or 64, False)
-    able = [goal.paths or min(MOST_PATHS, (m.pace or pace).paths_in(goal.seconds, goal.work(m.nodes))) for m in tried]
+    able = [goal.paths or m.paths_in(goal.seconds, goal.work(m.nodes)) for m in tried]
     kept = [choice(m, n, True) for m, n in zip(tried, able) if n >= FEWEST_PATHS]
     if kept:
         return min(kept, key=lambda c: c.error)
@@ -102,115 +100,78 @@ def choose(tried: Sequence[Measured], pace: Pace, goal: Goal) -> Choice:
 
 
 @dataclass(frozen=True, eq=False)
-class Look:
-    """Grids measured at some points with some bounces, and the best of them."""
-
-    points: int
-    bounces: int
-    choice: Choice
-    tried: tuple[Measured, ...]
-
-
-@dataclass(frozen=True, eq=False)
-class Search:
-    """What all looks share."""
+class Pilot:
+    """Tries runs of more and more nodes, at more and more points: of lattices, or of nodes that first looks choose."""
 
     scene: Scene
     tracer: Tracer
     goal: Goal
-    pace: Pace
-    looking: bool  # whether a first look may choose the nodes
+    looking: bool  # whether a first look chooses the nodes
+    followed: int  # bounces, where no light is known in which paths end
     seed: int  # of the run
     until: float  # of the clock: then the run is to end
-    ahead: dict[int, Ahead] = field(default_factory=dict)  # first looks so far
-    took: dict[int, float] = field(default_factory=dict)  # seconds of a look and of what was measured of it
+    ahead: dict[int, Ahead] = field(default_factory=dict)  # by size, those tried so far
 
-    def look(
-        self, sizes: Sequence[int], points: int, error: float, seed: int, most: int,
-        kinds: Sequence[bool] = (False, True),
-    ) -> Look:  # fmt: skip
-        """Measure grids from coarse to fine at some points, until finer ones cannot be the choice.
+    def tried(self, sizes: Sequence[int]) -> list[Measured]:
+        """Runs of the sizes that may be the choice, measured at more and more points as long as they are worth it.
 
-        First lattices, then nodes that first looks choose.
+        For a time while a look takes less than a sixth of the run. For an error at many points in any case, for at few
+        a run may be good enough by chance, with every finer run in turn until one will do; and at more while they
+        differ too much to tell. First looks begin with many: nodes that lookups read are then soon the same.
         """
-        probe = Probe.start(self.scene, self.tracer, points, error, seed, most)
-        followed = self.goal.bounces
-        if followed is None:
-            followed, _ = enough_bounces(self.scene, self.tracer, seed, SHARE * error)
-        found, goal = list[Measured](), replace(self.goal, texels=0)
-        for looking in kinds[: 1 + self.looking]:
-            for left, size in zip(range(len(sizes), 0, -1), sizes):
-                if looking and self._too_late(size, found):
+        goal, near = self.goal, sizes
+        counts = IN_TIME if goal.error is None else OF_LOOKS if self.looking else OF_LATTICES
+        for again, points in enumerate(counts):
+            found, took = self.look(near, points, shifted_seed(self.seed, again))
+            choice = choose(found, goal)
+            near = [n for n in sizes if 0.6 < n / choice.measured.grid < (np.inf if goal.error else 1.7)]
+            if goal.error is None:
+                near = [n for n in near if n in took]
+                if MORE * sum(took[n] for n in near) > choice.seconds / 6:
                     break
-                found.append(now := self._measured(probe, size, looking, followed))
-                pace = now.pace or self.pace
-                if pace.seconds(now.nodes, FEWEST_PATHS) > goal.seconds or now.nodes > MOST_NODES:
+            elif points > OF_LATTICES[0]:
+                sure = choice.measured.parts.uncertain <= 0.05 * goal.error**2
+                if sure or MORE * sum(took.values()) > max(SOON, choice.seconds):
                     break
-                if goal.error is not None:
-                    choice = choose(found, self.pace, replace(goal, paths=None))
-                    # A finer grid has twice the nodes or more, and needs the paths that the noise alone asks for.
-                    least = pace.seconds(2 * now.nodes, now.paths_within(goal.error**2))
-                    hopeless = looking and now.floor > (2.0**left * goal.error) ** 2  # at best half the error each
-                    if hopeless or (choice.met and least >= choice.seconds):
-                        break
-        return Look(points, followed, choose(found, self.pace, self.goal), tuple(found))
-
-    def _measured(self, probe: Probe, size: int, looking: bool, bounces: int) -> Measured:
-        if not looking:
-            return probe.measure(lattice(specs_over(self.scene, size), self.tracer, bounces), TRIAL_PATHS)
-        begun = time.perf_counter()
-        if size not in self.ahead:
-            self.ahead[size] = looked(self.scene, self.tracer, size, self.goal.bounces, self.seed)
-        found = probe.measure(self.ahead[size], LOOKED_PATHS)
-        self.took[size] = time.perf_counter() - begun
         return found
 
-    def _too_late(self, size: int, found: Sequence[Measured]) -> bool:
-        """Whether a first look at so many nodes takes longer than what is known to do, or than there is time."""
-        before = found[-1] if found and found[-1].looked else None
-        if size in self.ahead or before is None or before.pace is None or len(self.took) < 2:  # the first loads kernels
-            return False
-        times: float = (size / before.grid) ** 3
-        takes: float = times**0.75 * self.took[before.grid]  # part of it is the same for any size
-        if self.goal.error is None:
-            return time.perf_counter() + takes + times * before.pace.seconds(before.nodes, FEWEST_PATHS) > self.until
-        best = choose(found, self.pace, self.goal)
-        return takes > (best.seconds if best.met else LONG)
+    def look(self, sizes: Sequence[int], points: int, seed: int) -> tuple[list[Measured], dict[int, float]]:
+        """Runs measured at some points, from coarse to fine, until finer ones cannot be the choice.
 
-    def first(self, sizes: Sequence[int], seed: int) -> Look:
-        """For an error, a few hundred points; for a time, a tenth of it, and half of that for the reference."""
-        points, most = 384, 1024
-        if self.goal.error is None:
-            each = 2 * 8 * TRIAL_PATHS * self.pace.path
-            if len(sizes) > 1 and each * len(sizes) * 96 > 0.1 * self.goal.seconds:
-                sizes = sizes[len(sizes) % 2 :: 2]
-            each += self.looking * LOOKED_COST * self.pace.path
-            points = int(np.clip(0.1 * self.goal.seconds / (each * len(sizes)), 64, 384))
-            most = int(np.clip(0.05 * self.goal.seconds / (REFERENCE_COST * self.pace.path * points), 64, most))
-        return self.look(sizes, points, self.goal.error or 0.02, seed, most)
-
-    def closer(self, look: Look, sizes: Sequence[int], seed: int, late: bool) -> Look:
-        """Look at more points around the choice: for a sixth of the run's time, for an error as long as they differ.
-
-        For an error every finer grid, in turn: the choice may have been so good by chance.
+        And the seconds that each took, without its first look, which is taken once.
         """
-        goal, chosen = self.goal, look.choice.measured.grid
-        near = [size for size in sizes if 0.6 < size / chosen < (1.7 if goal.error is None else np.inf)]
-        if look.choice.measured.looked and goal.error is None:
-            near = [size for size in near if size in self.ahead]
-        of_grid = LOOKED_COST if look.choice.measured.looked else 2 * 8 * TRIAL_PATHS
-        each = self.pace.path * (of_grid * len(near[:3]) + REFERENCE_COST * 128)  # seconds a point
-        more = 4096
-        if goal.error is None:  # after a slow first look, what is left is for the run
-            more = 0 if late else int(min(8192.0, look.choice.seconds / 6 / each))
-        while more > 1.5 * look.points:
-            # More points tell more than a sharper reference at each: its variance is subtracted.
-            error = goal.error or look.choice.error
-            look, more = self.look(near, more, error, seed, 128, (look.choice.measured.looked,)), 0
-            if goal.error is not None and look.choice.measured.parts.uncertain > 0.05 * goal.error**2:
-                # A few points carry the error, as where the field is noisy: many more are needed to tell it.
-                more = int(min(4 * look.points, 16384, max(SOON, look.choice.seconds) / each))
-        return look
+        probe = Probe.start(self.scene, self.tracer, points, self.goal.error or FOR_A_TIME, seed)
+        found, took, last = list[Measured](), dict[int, float](), 0.0
+        for left, size in zip(range(len(sizes), 0, -1), sizes):
+            if found and self._enough(found, left, size, last if len(found) > 1 else 0.0):  # the first loads kernels
+                break
+            begun = time.perf_counter()
+            if size not in self.ahead:
+                self.ahead[size] = (
+                    looked(self.scene, self.tracer, size, self.goal.bounces, self.seed)
+                    if self.looking
+                    else lattice(specs_over(self.scene, size), self.tracer, self.followed)
+                )
+            lit = time.perf_counter()
+            found.append(probe.measure(self.ahead[size], LOOKED_PATHS if self.looking else TRIAL_PATHS))
+            last, took[size] = time.perf_counter() - begun, time.perf_counter() - lit
+        return found, took
+
+    def _enough(self, found: Sequence[Measured], left: int, size: int, took: float) -> bool:
+        """Whether a run of the next size, and the finer ones `left`, cannot be the choice, or take too long to try."""
+        goal, now = replace(self.goal, texels=0), found[-1]
+        times: float = (size / now.grid) ** 3
+        takes = times**0.75 * took  # part of it is the same for any size
+        if now.nodes > MOST_NODES:
+            return True
+        if goal.error is None:
+            return bool(time.perf_counter() + takes + times * now.seconds(now.nodes, FEWEST_PATHS) > self.until)
+        best = choose(found, replace(goal, paths=None))
+        if not best.met:  # each finer one has at best half the error
+            return now.floor > (2.0**left * goal.error) ** 2 or takes > LONG
+        # A finer one has twice the nodes or more, and needs the paths that the noise alone asks for.
+        least = now.seconds(2 * now.nodes, now.paths_within(goal.error**2))
+        return bool(max(least, takes) >= best.seconds)
 
 
 def planned(
@@ -231,38 +192,30 @@ def planned(
 
     In the least time for a relative root mean square `error`, or the least error in `seconds`, with this choice and the
     light of walls at `levels` included; the tracer marches level sets. For an error, texels as well: of each wall, at
-    least as many as it has. If `looking`, or else, nodes that a first look chooses, which comes with the plan.
+    least as many as it has. If `looking`, a first look chooses the nodes, which comes with the plan.
     """
     begun = time.perf_counter()
     left = np.inf if seconds is None else JUDGED * seconds
     goal = Goal(error, left, sum(len(queries) for queries in wall_queries(scene, levels)), paths, bounces)
-    candidates = sizes(scene) if grid is None else [grid]
-    depth = 4 if scene.open else 12  # light lives long in a closed room
-    middle = specs_over(scene, candidates[len(candidates) // 2])
-    pace = measure_pace(scene, tracer, middle, 32, depth, seed, 1 << 14)
-    search = Search(scene, tracer, goal, pace, looking, seed, begun + left)
-    look = search.first(candidates, seed)
-    look = search.closer(look, candidates, shifted_seed(seed, 1), time.perf_counter() - begun > 0.35 * left)
-    about = 1 << 16 if seconds is None else int(np.clip(0.02 * left / search.pace.path, 1 << 12, 1 << 16))
-    specs = specs_over(scene, look.choice.measured.grid)
-    pace = measure_pace(scene, tracer, specs, look.choice.paths, look.bounces, seed, about)
-    walls = walls_for(scene, tracer, levels, look.bounces, error, seed) if error and texels is None else None
+    followed = enough_bounces(scene, tracer, seed, SHARE * (error or FOR_A_TIME))[0] if bounces is None else bounces
+    pilot = Pilot(scene, tracer, goal, looking, followed, seed, begun + left)
+    tried = pilot.tried(sizes(scene) if grid is None else [grid])
+    walls = walls_for(scene, tracer, levels, followed, error, seed) if error and texels is None else None
     if walls is not None:
         fine = wall_queries(finer_texels(scene, walls.finer), levels)
         goal = replace(goal, texels=sum(len(queries) for queries in fine))
-    pilot = time.perf_counter() - begun
-    choice = choose(look.tried, pace, replace(goal, seconds=left - pilot))
-    why = reasons(scene, choice, look.bounces, walls)
-    said = outlook(look.tried, pace, replace(goal, seconds=np.inf if seconds is None else seconds), choice, pilot)
-    ahead = search.ahead[choice.measured.grid] if choice.measured.looked else None
+    spent = time.perf_counter() - begun
+    choice = choose(tried, replace(goal, seconds=left - spent))
+    said = outlook(tried, replace(goal, seconds=np.inf if seconds is None else seconds), choice, spent)
+    m = choice.measured
     return Plan(
-        choice.measured.grid, choice.paths, None if ahead and bounces is None else look.bounces, choice.error,
-        choice.seconds, choice.measured.nodes * (choice.measured.pace or pace).node, choice.met, why,
-        1.0 if walls is None else walls.finer, ahead is not None, said,
-    ), ahead  # fmt: skip
+        m.grid, choice.paths, bounces if looking else followed, choice.error, choice.seconds, m.nodes * m.node,
+        choice.met, reasons(scene, choice, None if looking else followed, walls),
+        1.0 if walls is None else walls.finer, looking, said,
+    ), pilot.ahead[m.grid] if looking else None  # fmt: skip
 
 
-def outlook(tried: Sequence[Measured], pace: Pace, goal: Goal, choice: Choice, pilot: float) -> str:
+def outlook(tried: Sequence[Measured], goal: Goal, choice: Choice, pilot: float) -> str:
     """What a user should know before the light is computed; empty if the run is short and as good as asked.
 
     Times that another goal would take include the seconds of the pilot, as those of `goal` do.
@@ -270,7 +223,7 @@ def outlook(tried: Sequence[Measured], pace: Pace, goal: Goal, choice: Choice, p
     if goal.error is None:
         if choice.met and choice.error <= CRUDE:
             return ""
-        better = choose(tried, pace, replace(goal, error=CRUDE, seconds=np.inf))
+        better = choose(tried, replace(goal, error=CRUDE, seconds=np.inf))
         cost = f"; {CRUDE:.0%} takes about {_time(pilot + better.seconds)}" if better.met else ""
         return (
             f"{goal.seconds:g} seconds are too short for this scene: an error of about {choice.error:.0%} is predicted"
@@ -282,7 +235,7 @@ def outlook(tried: Sequence[Measured], pace: Pace, goal: Goal, choice: Choice, p
         )
     if choice.seconds <= LONG:
         return ""
-    soon = choose(tried, pace, replace(goal, error=None, seconds=LONG))
+    soon = choose(tried, replace(goal, error=None, seconds=LONG))
     least = f"; --seconds {LONG:g} reaches about {soon.error:.1%}" if soon.met else ""
     return f"an error of {goal.error:.1%} is predicted to take {_time(choice.seconds)}{least}"
 
@@ -293,25 +246,23 @@ def _time(seconds: float) -> str:
     return f"{seconds:.0f} seconds" if seconds >= 9.5 else f"{seconds:.2g} seconds"
 
 
-def reasons(scene: Scene, choice: Choice, bounces: int, walls: Walls | None = None) -> tuple[str, ...]:
-    """What was chosen, why, and what was left out, in sentences."""
+def reasons(scene: Scene, choice: Choice, bounces: int | None, walls: Walls | None = None) -> tuple[str, ...]:
+    """What was chosen, why, and what was left out, in sentences; `bounces` are None where a first look has its own."""
     m, part = choice.measured, choice.measured.parts
     still, noise = np.sqrt(max(0.0, part.grid + part.uncovered)), np.sqrt(max(0.0, m.squared(choice.paths) - m.floor))
-    if m.looked:
-        return (
-            f"a first look at {m.grid} nodes along the longest axis chose {m.nodes} to light: interpolation between "
-            f"them is off by {still:.1%}",
-            f"{choice.paths} paths: noise of {noise:.1%} after interpolation",
-        )
+    longest = f"{m.grid} nodes along the longest axis"
+    paths = f"{choice.paths} paths: noise of {noise:.1%} after interpolation"
+    if bounces is None:
+        chosen = f"a first look at {longest} chose {m.nodes} to light"
+        return f"{chosen}: interpolation between them is off by {still:.1%}", paths
     nodes = sum(int(np.prod(spec.shape)) for spec in specs_over(scene, m.grid))
-    on_walls = []
-    if walls is not None:
-        longest = max(n for quad in finer_texels(scene, walls.finer).quads for n in quad.texels)
-        on_walls = [f"{longest} texels along walls: between them and rows of the sweep light is off by {walls.off:.1%}"]
-    return (
-        f"{m.grid} nodes along the longest axis: interpolation between them is off by {still:.1%}",
-        f"{choice.paths} paths: noise of {noise:.1%} after interpolation",
+    said = (
+        f"{longest}: interpolation between them is off by {still:.1%}",
+        paths,
         f"{bounces} bounces: further ones would add {np.sqrt(part.bounces):.1%}",
         f"{nodes - m.nodes} of {nodes} nodes are omitted: no isosurface of the range is near them",
-        *on_walls,
     )
+    if walls is None:
+        return said
+    texels = max(n for quad in finer_texels(scene, walls.finer).quads for n in quad.texels)
+    return *said, f"{texels} texels along walls: between them and rows of the sweep light is off by {walls.off:.1%}"

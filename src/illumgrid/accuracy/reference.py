@@ -1,7 +1,6 @@
 """Converged light at points that nobody asked for, and how far a grid is from it: noise, nodes, holes, bounces."""
 
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -11,7 +10,6 @@ from numpy.typing import NDArray
 from illumgrid.accuracy.points import other_paths
 from illumgrid.bake.accumulator import Bake
 from illumgrid.field.volume import Floats
-from illumgrid.grid import IlluminationGrid
 from illumgrid.rng import shifted_seed
 from illumgrid.transport.samples import Queries
 from illumgrid.transport.tracer import Tracer
@@ -116,15 +114,6 @@ class Errors:
     median: float  # as p95, over points of the root mean square over colours
     p95: float
     bias: float  # mean difference; below 0 the grid is too dark
-
-
-def look_up(grids: Sequence[IlluminationGrid], asked: Queries) -> tuple[Floats, NDArray[np.bool_]]:
-    """Light (n, 3) that grids hold at the points of queries, each in the grid of its field; and as `Corners.read`."""
-    light, covered = np.zeros((len(asked), 3)), np.zeros(len(asked), bool)
-    for number, grid in enumerate(grids):
-        own = asked.target == number
-        light[own], covered[own] = grid.lookup(asked.point[own]), grid.covered(asked.point[own])
-    return light, covered
 
 
 def errors(light: Floats, reference: Reference) -> Errors:

@@ -5,18 +5,15 @@ points are lit, and what they hold there is compared with the light at the point
 """
 
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 
 from illumgrid.accuracy.points import unseen_on_walls
 from illumgrid.accuracy.reference import begin, parts_of
 from illumgrid.bake.accumulator import Bake
-from illumgrid.bake.walls import at_texels, place_on_walls
+from illumgrid.bake.around import texels_around
 from illumgrid.field.scene import Levels, Scene, finer_texels
 from illumgrid.rng import shifted_seed
-from illumgrid.samplers.direct import Corners, Part
-from illumgrid.transport.samples import Queries
 from illumgrid.transport.tracer import Tracer
 
 FINER = (1.0, 2**0.5, 2.0, 8**0.5, 4.0)
@@ -26,25 +23,12 @@ SHARE = 0.7  # of the asked error that texels may be off: the rest is noise
 GAIN = 0.9  # of the error of coarser texels, above which finer ones are not worth their time
 
 
-def texels_around(scene: Scene, levels: Levels, points: Queries) -> Corners:
-    """The eight texels that a lookup at each of some points on walls reads."""
-    quad, u, v, t = place_on_walls(scene, points)
-
-    def part(number: int) -> Part:
-        own, (nu, nv), rows = np.flatnonzero(quad == number), scene.quads[number].texels, len(levels.table)
-        index = np.stack([t[own] * (rows - 1), v[own] * nv - 0.5, u[own] * nu - 0.5], axis=1)
-        return own, (rows, nv, nu), index, partial(at_texels, scene, levels, number)
-
-    return Corners.of(len(points), map(part, np.unique(quad).tolist()), 0)
-
-
 @dataclass(frozen=True)
 class Walls:
     """How finely walls are divided, and by how much reading between texels and rows is then off, relative."""
 
     finer: float  # texels along each edge for each of the scene's
     off: float
-    met: bool
 
 
 def walls_for(scene: Scene, tracer: Tracer, levels: Levels, bounces: int, error: float, seed: int) -> Walls | None:
@@ -56,15 +40,14 @@ def walls_for(scene: Scene, tracer: Tracer, levels: Levels, bounces: int, error:
     truth = begin(tracer, unseen_on_walls(scene, POINTS, seed), bounces, seed, REFERENCE_PATHS)
     if not truth.mean > 0:
         return None
-    seeds, best = (seed, shifted_seed(seed, 2**62)), Walls(0.0, np.inf, False)
+    seeds, best = (seed, shifted_seed(seed, 2**62)), Walls(0.0, np.inf)
     for finer in FINER:
         around = texels_around(finer_texels(scene, finer), levels, truth.queries)
         bakes = (Bake.of([around.asked], bounces, s).walk(tracer, range(PATHS)) for s in seeds)
         (one, covered), (other, _) = (around.read(bake.samples) for bake in bakes)
         parts = parts_of(one, other, covered, truth, truth)
-        off = float(np.sqrt(max(parts.grid + parts.uncovered, 0.0)))
-        walls = Walls(finer, off, off <= SHARE * error)
-        if walls.met:
+        walls = Walls(finer, float(np.sqrt(max(parts.grid + parts.uncovered, 0.0))))
+        if walls.off <= SHARE * error:
             return walls
-        best = walls if off < GAIN * best.off else best
+        best = walls if walls.off < GAIN * best.off else best
     return best

@@ -7,13 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from illumgrid.bake.accumulator import Bake, Map, Progress
-from illumgrid.bake.targets import (
-    HELD_ROWS,
-    coarse_first,
-    held_queries,
-    node_queries,
-    of_field,
-)
+from illumgrid.bake.targets import HELD_ROWS, coarse_first, filled, held_queries, node_queries
 from illumgrid.bake.walls import texel_paths, wall_queries, wall_texture
 from illumgrid.field.scene import Levels, Scene
 from illumgrid.field.volume import interpolate, world_to_index
@@ -131,21 +125,17 @@ def bake(
     del ranks, tracer
     clock.append(time.perf_counter())
 
-    grids, walked = [], state.paths
-    rows = list(state.answers[count : count + len(held)])
-    answers = [*state.answers[:count], *state.answers[count + len(held) :]]
+    grids, walked = list[IlluminationGrid](), state.paths
+    rows, on_quads = list(state.answers[count : count + len(held)]), state.answers[count + len(held) :]
+    filling = filled(scene, specs, interpolator, state.answers[:count])
     del state, held
-    for number, spec in enumerate(specs):
-        samples = of_field(scene, answers, number)
-        answers = [a for a in answers if (a.queries.target > number).any()]  # a large run is held once, not twice
-        nodes_of = Nodes(spec, scene.fields[number], number)
-        grids.append(fill_nodes(interpolator, samples, nodes_of))
-        if scene.fields[number].isovalue is not None:
-            lit = tuple(fill_nodes(interpolator, rows.pop(0), nodes_of) for _ in range(HELD_ROWS))
-            grids[-1] = replace(grids[-1], rows=lit)
-        del samples
+    for number, (field, grid) in enumerate(zip(scene.fields, filling)):
+        if field.isovalue is not None:
+            nodes_of = Nodes(grid.spec, field, number)
+            grid = replace(grid, rows=tuple(fill_nodes(interpolator, rows.pop(0), nodes_of) for _ in range(HELD_ROWS)))
+        grids.append(grid)
         progress("grid", number + 1, len(specs))
-    walls = [wall_texture(len(levels.table), quad, answer) for quad, answer in zip(scene.quads, answers)]
+    walls = [wall_texture(len(levels.table), quad, answer) for quad, answer in zip(scene.quads, on_quads)]
     clock.append(time.perf_counter())
     return Baked(
         grids=tuple(grids),

@@ -4,17 +4,24 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
+from illumgrid.bake.bounces import enough_bounces
 from illumgrid.bake.known import light_known_first
 from illumgrid.bake.refined import ROUGH, Chosen, chosen, written
-from illumgrid.constants import PATHS
+from illumgrid.constants import BASE, PATHS
 from illumgrid.field.diagnosis import noisy
+from illumgrid.field.lattice import specs_over
 from illumgrid.field.layers import layers_of
-from illumgrid.field.scene import Levels, Scene
+from illumgrid.field.scene import Levels, Scene, level_table
 from illumgrid.grid import GridSpec
 from illumgrid.grid.cache import cache_of
 from illumgrid.grid.nested import finer, halvings
+from illumgrid.grid.nodes import reached
 from illumgrid.interpolators.bilateral import Bilateral
+from illumgrid.interpolators.nearest import Nearest
 from illumgrid.interpolators.nested import Nested
+from illumgrid.samplers.direct import Direct
 from illumgrid.stages import Interpolator, Sampler
 from illumgrid.transport.stages import capabilities
 from illumgrid.transport.tracer import Tracer, ending_in
@@ -37,6 +44,11 @@ class Ahead:
     bounces: int = 0  # that its paths follow
     name: str = ""  # of what was lit ahead
 
+    @property
+    def levels(self) -> int:
+        """How often a first look halved the spacing of its lattice."""
+        return self.refined["levels"] if self.refined else 0
+
 
 def light_ahead(
     scene: Scene, specs: Sequence[GridSpec], levels: Levels, tracer: Tracer, stages: tuple[Any, Any, Any], *,
@@ -56,6 +68,28 @@ def light_ahead(
         [finer(spec, nodes.levels) for spec in specs], Chosen(nodes.flat), ending, Nested(nodes.levels),
         cached or in_look, written(nodes, specs), nodes.paths, bounces, "look",
     )  # fmt: skip
+
+
+def lattice(specs: Sequence[GridSpec], tracer: Tracer, bounces: int) -> Ahead:
+    """All nodes of some lattices, with nothing lit ahead."""
+    return Ahead(specs, Direct(), tracer, Nearest(), bounces=bounces)
+
+
+def looked(scene: Scene, tracer: Tracer, longest: int | None, bounces: int | None, seed: int) -> Ahead:
+    """What `run` lights ahead from a lattice of so many nodes; by default its own nodes and bounces."""
+    return light_ahead(
+        scene, specs_over(scene, longest, BASE), level_table(scene, 2), tracer, (None, None, None), refining=True,
+        cached=False, automatic=bounces is None, seed=seed,
+        bounces=enough_bounces(scene, tracer, seed)[0] if bounces is None else bounces,
+    )  # fmt: skip
+
+
+def nodes_to_light(scene: Scene, ahead: Ahead) -> int:
+    """How many nodes a run asks."""
+    if isinstance(ahead.sampler, Chosen):
+        return sum(map(len, ahead.sampler.nodes))
+    # The numbers of the nodes would take eight times more than which they are.
+    return sum(int(np.count_nonzero(reached(field, spec))) for field, spec in zip(scene.fields, ahead.specs))
 
 
 def refinable_by(scene: Scene, sampler: Any, backend: Any, interpolator: Any) -> bool:

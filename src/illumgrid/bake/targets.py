@@ -1,16 +1,17 @@
-"""What is asked beside the nodes, in which order, and whose answer is whose: texels of walls, levels that are held."""
+"""What is asked at nodes, in which order, and what becomes of the answers: the grid of each field."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from illumgrid.field.scene import Levels, Scene
 from illumgrid.field.volume import world_to_index
-from illumgrid.grid import GridSpec, channels_of
+from illumgrid.grid import GridSpec, IlluminationGrid, Nodes, channels_of
 from illumgrid.samplers.direct import Direct, NodeQueries
-from illumgrid.stages import Sampler
+from illumgrid.stages import Interpolator, Sampler
 from illumgrid.transport.samples import Queries, Samples, join_queries, join_samples
+from illumgrid.transport.stages import fill_nodes
 
 HELD_ROWS = 5
 """Places of the sweep, its ends among them, at which a level that is held is lit."""
@@ -73,3 +74,15 @@ def of_field(scene: Scene, answers: Sequence[Samples], number: int) -> Samples:
     channels = channels_of(scene)
     none = np.zeros((0, len(channels)), np.float32)
     return Samples(Queries.at(scene, np.zeros((0, 3))), none, none, np.zeros(0, np.int32), channels)
+
+
+def filled(
+    scene: Scene, specs: Sequence[GridSpec], interpolator: Interpolator, answers: Sequence[Samples]
+) -> Iterator[IlluminationGrid]:
+    """The grid of each field, one after the other, from the light at all of its nodes, or at some of them."""
+    for number, (field, spec) in enumerate(zip(scene.fields, specs)):
+        samples = of_field(scene, answers, number)
+        answers = [a for a in answers if (a.queries.target > number).any()]  # a large run is held once, not twice
+        grid = fill_nodes(interpolator, samples, Nodes(spec, field, number))
+        del samples
+        yield grid

@@ -1,5 +1,6 @@
 """Nodes of a grid over a volume: where they lie."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -73,3 +74,8 @@ def nodes_over(volume: Volume, longest: int | None = None, density: float = DENS
 def specs_over(scene: Scene, longest: int | None = None, density: float = DENSITY) -> list[GridSpec]:
     """Nodes of every field's grid: see `nodes_over`."""
     return [nodes_over(field.volume, longest, density) for field in scene.fields]
+
+
+def along_longest(specs: Sequence[GridSpec]) -> int:
+    """Nodes along the longest axis of all lattices."""
+    return max(max(spec.shape) for spec in specs)

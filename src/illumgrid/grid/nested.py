@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from illumgrid.constants import FINEST
-from illumgrid.field.lattice import GridSpec
+from illumgrid.field.lattice import GridSpec, along_longest
 from illumgrid.grid.illumination import IlluminationGrid
 
 
@@ -19,8 +19,7 @@ def finer(spec: GridSpec, levels: int) -> GridSpec:
 
 def halvings(specs: Sequence[GridSpec]) -> int:
     """How often the spacing of lattices is halved where light is rough: up to twice, 0 if they are too large."""
-    longest = max(max(spec.shape) for spec in specs) - 1
-    return next((levels for levels in (2, 1) if longest * 2**levels < FINEST), 0)
+    return next((levels for levels in (2, 1) if (along_longest(specs) - 1) * 2**levels < FINEST), 0)
 
 
 def coarser(spec: GridSpec, levels: int) -> GridSpec:

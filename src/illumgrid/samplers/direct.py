@@ -15,7 +15,7 @@ from illumgrid.field.scene import Scene
 from illumgrid.field.volume import Floats, index_to_world, interpolate, project, world_to_index
 from illumgrid.field.volume import corners as corners_of
 from illumgrid.grid import GridSpec
-from illumgrid.grid.nodes import reachable, reached
+from illumgrid.grid.nodes import reachable
 from illumgrid.stages import Sampler, hookimpl
 from illumgrid.transport.samples import Queries, Samples, join_queries
 
@@ -132,10 +132,9 @@ class Corners:
     asked: Queries  # one for each such node
     row: NDArray[np.int64]  # (n, 8): where in `asked` the nodes of each point are
     weight: Floats  # (n, 8): trilinear
-    nodes: int  # how many nodes the whole would have to light
 
     @classmethod
-    def of(cls, points: int, parts: Iterable[Part], nodes: int) -> "Corners":
+    def of(cls, points: int, parts: Iterable[Part]) -> "Corners":
         """Gather the nodes of so many points from parts: a lattice each, which some of the points lie in."""
         row, weight = np.zeros((points, 8), np.int64), np.zeros((points, 8))
         found, first = list[Queries](), 0
@@ -146,7 +145,7 @@ class Corners:
             row[own], weight[own] = first + place.reshape(-1, 8), np.stack(share, axis=1)
             found.append(ask(unique))
             first += len(unique)
-        return cls(join_queries(found), row, weight, nodes)
+        return cls(join_queries(found), row, weight)
 
     def read(self, samples: Samples) -> tuple[Floats, NDArray[np.bool_]]:
         """Light (n, 3) at the points, and whether (n,) all of their nodes have light of their own.
@@ -167,9 +166,7 @@ def corners(scene: Scene, specs: Sequence[GridSpec], points: Queries) -> Corners
         own = np.flatnonzero(points.target == number)
         return own, spec.shape, world_to_index(spec, points.point[own]), partial(at_nodes, scene, number, spec)
 
-    # The numbers of the nodes to light would take eight times more than which they are.
-    nodes = sum(int(np.count_nonzero(reached(field, spec))) for field, spec in zip(scene.fields, specs))
-    return Corners.of(len(points), [part(number, spec) for number, spec in enumerate(specs)], nodes)
+    return Corners.of(len(points), [part(number, spec) for number, spec in enumerate(specs)])
 
 
 @hookimpl

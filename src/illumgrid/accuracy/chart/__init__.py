@@ -8,23 +8,20 @@ from itertools import product
 import numpy as np
 
 from illumgrid import registry, tone
-from illumgrid.accuracy.around import lattice
 from illumgrid.accuracy.chart.contestants import Method, methods, tracers
 from illumgrid.accuracy.chart.race import SEEDS, Flip, Point, Race, front
-from illumgrid.accuracy.cost import measure_pace
 from illumgrid.accuracy.points import unseen_on_level_sets
 from illumgrid.accuracy.probe import Measured, Probe
 from illumgrid.accuracy.reference import Reference, begin, converge
 from illumgrid.bake.accumulator import Progress
-from illumgrid.bake.ahead import BY_NORMAL, by_normal_in, refinable_by
+from illumgrid.bake.ahead import BY_NORMAL, by_normal_in, lattice, nodes_to_light, refinable_by
 from illumgrid.bake.bounces import enough_bounces, light_left_out
 from illumgrid.bake.refined import LOOKED
 from illumgrid.constants import BASE, DENSITY, PATHS
 from illumgrid.errors import BadInput
-from illumgrid.field.lattice import specs_over
+from illumgrid.field.lattice import along_longest, specs_over
 from illumgrid.field.scene import Scene
 from illumgrid.grid import GridSpec
-from illumgrid.grid.nodes import reachable
 from illumgrid.interpolators.nearest import Nearest
 from illumgrid.interpolators.nested import Nested
 from illumgrid.rng import shifted_seed
@@ -61,7 +58,7 @@ class Report:
 
 def sizes(scene: Scene) -> list[int]:
     """Grids that take part: a quarter, half, once and 1.6 times the nodes that `run` has by default."""
-    default = max(max(spec.shape) for spec in specs_over(scene))
+    default = along_longest(specs_over(scene))
     return sorted({max(4, round(default * share)) for share in (0.25, 0.5, 1.0, 1.6)})
 
 
@@ -102,7 +99,7 @@ def bench(
     flip = studio(scene, reference.tracer, exposure, reference.bounces, seed, paths) if studio else None
     able = methods([method for method in entrants if method.surface in references])
     race = Race(scene, references, able, sizes(scene), bounces, seed)
-    notes += _show_default(race, *default, budget)
+    notes += _show_default(race, *default, budget, pace * (bounces + 1) / (reference.bounces + 1))
     while contestant := race.next(racing - report()):
         race.advance(contestant)
     if not race.points:
@@ -141,18 +138,17 @@ def _references(
     """References by surface, level sets first, with 64 paths; and seconds for a path of the first."""
     found: dict[str, Reference] = {}
     pace = 0.0
-    surfaces = sorted({method.surface for method in entrants})
+    surfaces, rows = sorted({method.surface for method in entrants}), np.unique(asked.level, axis=0)
+    one = asked[(asked.level == rows[len(rows) // 2]).all(axis=1)]
     most, _ = enough_bounces(scene, _tracer_of(entrants, surfaces[0]), seed, 2e-4)
     for surface in surfaces:
         tracer, begun = _tracer_of(entrants, surface), time.perf_counter()
-        if found:  # meshes may take longer to build than rays to cast: try one level set
-            rows = np.unique(asked.level, axis=0)
-            begin(tracer, asked[(asked.level == rows[len(rows) // 2]).all(axis=1)], most, seed)
-            takes = (time.perf_counter() - begun) * len(rows)
-            if takes > OTHER * budget:
-                notes.append(f"backends of the {surface} do not compete: their reference would take {takes:.0f} s")
-                continue
-            begun = time.perf_counter()
+        begin(tracer, one, most, seed)  # meshes may take longer to build than rays to cast: try one level set
+        takes = (time.perf_counter() - begun) * len(rows)
+        if found and takes > OTHER * budget:
+            notes.append(f"backends of the {surface} do not compete: their reference would take {takes:.0f} s")
+            continue
+        begun = time.perf_counter()
         reference = begin(tracer, asked, most, seed)
         spent = time.perf_counter() - begun
         if len(reference):
@@ -177,46 +173,49 @@ def _sharpen(references: dict[str, Reference], error: dict[str, float], left: fl
         references[surface] = converge(references[surface], error[surface], 1 << 15, now + (end - now) / rest)
 
 
-def _show_default(race: Race, grid: int | None, paths: int | None, budget: float) -> list[str]:
-    """Chart `run`'s default; if it would take too much of the budget, predict it, or leave it out."""
-    scene, own = race.scene, registry.auto_backend()
-    able = (c.method for c in race.contestants if (c.method.surface, c.method.sampler) == ("levelset", Direct()))
-    method = plain = next((m for m in able if m.backend.name == own and Nearest() in m.interpolators), None)
+def _show_default(race: Race, grid: int | None, paths: int | None, budget: float, pace: float) -> list[str]:
+    """Chart `run`'s default; if it would take too much of the budget, predict it and others, or leave it out.
+
+    `pace` are seconds for a path.
+    """
+    scene, own = race.scene, ("levelset", Direct(), registry.auto_backend())
+    able = (m for m in race.methods if (m.surface, m.sampler, m.backend.name) == own and Nearest() in m.interpolators)
+    plain = method = next(able, None)
     if method is None or plain is None:
         return []
     filler: Interpolator = Nearest()
-    if grid is None and paths is None and refinable_by(scene, plain.sampler, plain.backend, filler):
+    stages = plain.sampler, plain.backend, filler
+    looked = grid is None and paths is None and refinable_by(scene, *stages)
+    if looked:
         filler = Nested()
-        method = replace(plain, interpolators=(filler,), denser=None, looked=True)
-    elif grid is None and by_normal_in(scene, plain.sampler, plain.backend, filler):
+    elif grid is None and by_normal_in(scene, *stages):
         filler, usual = BY_NORMAL
         paths = paths or usual
-        method = replace(plain, interpolators=(filler,), denser=None)
-    base = specs_over(scene, grid, BASE if method.looked else DENSITY)
-    shapes, begun = {max(spec.shape) for spec in base}, time.perf_counter()
-    pace = measure_pace(scene, method.tracer, base, 16, race.bounces, race.seed)
+    if filler != Nearest():
+        method = replace(plain, interpolators=(filler,), denser=None, looked=looked)
 
     def seconds(specs: Sequence[GridSpec], count: int) -> float:
-        return pace.seconds(sum(len(reachable(field, spec)) for field, spec in zip(scene.fields, specs)), count)
+        return pace * count * nodes_to_light(scene, lattice(specs, plain.tracer, race.bounces))
 
-    if method.looked:
-        takes = seconds(base, 2 * LOOKED)  # of twice the bounces
-        if takes > DEFAULT * budget:
-            return [f"run's default does not compete: its first look would take about {takes:.0f} s"]
-        takes *= 3  # the nodes that it chooses have as many paths and more to fill
-    else:
-        grid = shapes.pop() if len(shapes) == 1 else grid  # else fields of different size, each with its own default
-        takes = seconds(base, paths := paths or PATHS)
-    if takes <= DEFAULT * budget:
+    base = specs_over(scene, grid, BASE if looked else DENSITY)
+    look = seconds(base, 2 * LOOKED) if looked else 0.0  # of twice the bounces
+    if look > DEFAULT * budget:
+        return [f"run's default does not compete: its first look would take about {look:.0f} s"]
+    if not looked:
+        paths = paths or PATHS
+        if len({max(spec.shape) for spec in base}) == 1:  # else fields of different size, each with its own default
+            grid = along_longest(base)
+    # The nodes that a look chooses have as many paths and more to fill.
+    if (3 * look or seconds(base, paths or PATHS)) <= DEFAULT * budget:
         race.show_default(method, filler, grid, paths)
         return []
-    race.predict(method, filler, grid, paths, takes if method is plain else None, default=True)
+    begun = time.perf_counter()
+    race.predict(method, filler, grid, paths, default=True)
     more = [(seconds(specs_over(scene, n), count), n, count) for n in race.sizes[1:] for count in (8, 32, 128)]
-    for takes, size, count in sorted(more if method is plain else ()):
-        # As many nodes as those of the default, and as many seeds.
-        will = SEEDS * count * pace.path * 8 * len(race.references["levelset"])
+    for _, size, count in sorted(more if method is plain else ()):
+        will = SEEDS * count * pace * 8 * len(race.references["levelset"])
         if (size, count) != (grid, paths) and time.perf_counter() - begun + will < PREDICTED * budget:
-            race.predict(plain, filler, size, count, takes)
+            race.predict(plain, filler, size, count)
     return ["~ marks predicted times: only the nodes near reference points were computed"]
 
 

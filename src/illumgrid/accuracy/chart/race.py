@@ -8,14 +8,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from illumgrid.accuracy.around import around, filled, looked
 from illumgrid.accuracy.chart.contestants import COUNTS, Method
-from illumgrid.accuracy.reference import Reference, errors, look_up
+from illumgrid.accuracy.reference import Reference, errors
 from illumgrid.bake.accumulator import Bake
-from illumgrid.bake.ahead import Ahead
+from illumgrid.bake.ahead import Ahead, looked, nodes_to_light
+from illumgrid.bake.around import around, look_up
+from illumgrid.bake.targets import filled
 from illumgrid.constants import BASE, DENSITY
 from illumgrid.errors import BadInput
-from illumgrid.field.lattice import specs_over
+from illumgrid.field.lattice import along_longest, specs_over
 from illumgrid.field.scene import Scene
 from illumgrid.field.volume import Floats
 from illumgrid.grid import IlluminationGrid
@@ -66,7 +67,7 @@ class Run:
     def __init__(self, scene: Scene, method: Method, grid: int | None, bounces: int, seed: int) -> None:
         self.scene, self.method, self.grid, self.seed = scene, method, grid, seed
         specs = specs_over(scene, grid, BASE if method.looked else DENSITY)
-        self.longest = max(max(spec.shape) for spec in specs)
+        self.longest = along_longest(specs)
         self.ahead = Ahead(specs, method.sampler, method.tracer, method.interpolators[0], bounces=bounces)
         self.bake = Bake.of([], bounces, seed)
         self.asking = self.tracing = 0.0
@@ -100,8 +101,9 @@ class Run:
     def fill(self, interpolator: Interpolator) -> tuple[list[IlluminationGrid], float]:
         """Grids from the samples so far, and the seconds that the interpolator took."""
         begun = time.perf_counter()
-        ahead = self.ahead if self.method.looked else replace(self.ahead, interpolator=interpolator)
-        return filled(self.scene, ahead, self.bake.answers), time.perf_counter() - begun
+        filler = self.ahead.interpolator if self.method.looked else interpolator
+        grids = list(filled(self.scene, self.ahead.specs, filler, self.bake.answers))
+        return grids, time.perf_counter() - begun
 
 
 def front(points: Iterable[Point], references: dict[str, Reference]) -> list[Point]:
@@ -155,12 +157,11 @@ class Race:
         self.contestants.append(run)
 
     def predict(
-        self, method: Method, filler: Interpolator, grid: int | None, paths: int | None, takes: float | None,
-        default: bool = False,
-    ) -> None:  # fmt: skip
+        self, method: Method, filler: Interpolator, grid: int | None, paths: int | None, default: bool = False
+    ) -> None:
         """Chart a run by the nodes around the points, which hold what they would in all of it; one seed after a look.
 
-        Seconds that are not known are predicted from what these nodes take.
+        Its seconds are predicted from what these nodes take.
         """
         run, begun = self._run(method, grid), time.perf_counter()
         ahead, reference = run.look(), self.references[method.surface]
@@ -169,8 +170,9 @@ class Race:
         seeds, begun = range(1 if method.looked else SEEDS), time.perf_counter()
         bakes = [Bake.of([near.asked], ahead.bounces, shifted_seed(self.seed, k)) for k in seeds]
         found = [near.read(bake.walk(ahead.tracer, range(paths)).samples) for bake in bakes]
-        takes = takes or look + (time.perf_counter() - begun) / len(seeds) * near.nodes / len(near.asked)
-        point = Point(method, filler, grid, paths, near.nodes, found[0][1], run.longest, default=default, built=False)
+        nodes = nodes_to_light(self.scene, ahead)
+        takes = look + (time.perf_counter() - begun) / len(seeds) * nodes / max(1, len(near.asked))
+        point = Point(method, filler, grid, paths, nodes, found[0][1], run.longest, default=default, built=False)
         self.points.append(replace(point, seconds=[takes] * len(seeds), light=[light for light, _ in found]))
 
     def advance(self, run: Run) -> None:
@@ -214,20 +216,19 @@ class Race:
 
     def _unlock(self, run: Run, spent: float) -> None:
         """After a first step, enter the next finer grid, and on the coarsest more level sets."""
-
-        def enter(method: Method, grid: int, cost: float, factor: float) -> None:
+        entering = []  # method, grid, cost of its first step and factor of its slowdown
+        if run.grid in self.sizes and run.grid != self.sizes[-1]:
+            finer = next(size for size in self.sizes if size > run.longest)
+            # Twice the nodes may halve the error, for which noise would need four times the paths: so much sooner.
+            more = finer / run.longest
+            entering.append((run.method, finer, spent * more**3, 1 / more**2))
+        if run.method.denser and run.grid == self.sizes[0]:
+            entering.append((run.method.denser, self.sizes[0], spent * COUNTS[1] / COUNTS[0], 1.0))
+        for method, grid, cost, factor in entering:
             if not any((c.method, c.grid) == (method, grid) for c in self.contestants):
                 new = self._run(method, grid)
                 new.interpolators, new.cost, new.factor, new.ranked_by = run.interpolators, cost, factor, run.ranked_by
                 self.contestants.append(new)
-
-        finer = [size for size in self.sizes if size > run.longest]
-        if finer and run.grid in self.sizes:
-            # Twice the nodes may halve the error, for which noise would need four times the paths: so much sooner.
-            more = finer[0] / run.longest
-            enter(run.method, finer[0], spent * more**3, 1 / more**2)
-        if run.method.denser and run.grid == self.sizes[0]:
-            enter(run.method.denser, self.sizes[0], spent * COUNTS[1] / COUNTS[0], 1.0)
 
     def _point(self, run: Run, interpolator: Interpolator) -> tuple[Point, list[IlluminationGrid]]:
         grids, filling = run.fill(interpolator)
@@ -255,8 +256,7 @@ class Race:
         What the seeds will cost that the front still lacks is kept back.
         """
         kept = 1.1 * (SEEDS - 1) * sum(seconds for seconds, _ in self.missing_seeds())
-        able = [c for c in self.contestants if c.step < len(STEPS)]
-        able = [c for c in able if kept + SEEDS * c.cost < left or c.cost == 0.0]
+        able = (c for c in self.contestants if c.step < len(STEPS) and (kept + SEEDS * c.cost < left or c.cost == 0.0))
         standing = self._standing()
         return min(able, key=lambda c: (c.cost * self._slowdown(c, standing), c.longest), default=None)
 
