@@ -117,6 +117,21 @@ def cached_light(
     return light, ends
 
 
+def emission_weight(
+    scene: Marchable, normal: Floats, t: Floats, number: Ints, wall: Bools, approach: Floats, d: Floats
+) -> Floats:
+    """Weight (n,) of what surfaces emit towards the ends of rays that left along d, by the cosine about `normal`.
+
+    It is 1 but on walls. A quad emits on its front only, where `approach`, the cosine for each wall, is negative. A
+    lamp is asked for light as well: it has the weight of the balance heuristic.
+    """
+    weight = np.ones(len(t))
+    by_cosine = np.einsum("ij,ij->i", normal[wall], d[wall]) / np.pi
+    by_lamp = lamp_density(scene, number[wall] - len(scene.twin), t[wall], d[wall])
+    weight[wall] = np.where(approach < 0, by_cosine / (by_cosine + by_lamp), 0.0)
+    return weight
+
+
 def walk(
     surfaces: Surfaces,
     cache: Cache,
@@ -172,13 +187,10 @@ def walk(
         goes_on = (what != MISS) & (what != BURIED)
         alive, t, d, number, what, face = (array[goes_on] for array in (alive, t, d, number, what, face))
 
-        # Account for what the surface emits: a quad on its front only, weighted if it is a lamp.
-        weight, wall = np.ones(len(alive)), what == QUAD
-        quad = number[wall] - fields
-        by_cosine = np.einsum("ij,ij->i", normal[alive[wall]], d[wall]) / np.pi
-        approach = np.einsum("ij,ij->i", scene.quad_normal[quad], d[wall])
-        by_lamp = lamp_density(scene, quad, t[wall], d[wall])
-        weight[wall] = np.where(approach < 0, by_cosine / (by_cosine + by_lamp), 0.0)
+        # Account for what the surface emits.
+        wall = what == QUAD
+        approach = np.einsum("ij,ij->i", scene.quad_normal[number[wall] - fields], d[wall])
+        weight = emission_weight(scene, normal[alive], t, number, wall, approach, d)
         worth[alive] += keep[alive] * weight[:, None] * scene.emission[number]
 
         # Reflect: the albedo takes its share, and the path goes on from the hit.
@@ -190,7 +202,7 @@ def walk(
             here = np.flatnonzero(moved & (number == f))
             side = np.where((within[alive[here]] >> f & 1) & (what[here] == SURFACE), -1.0, 1.0)
             normal[alive[here]] = side[:, None] * surfaces.normal(f, what[here], face[here], x[alive[here]], d[here])
-        normal[alive[wall]] = -np.sign(approach)[:, None] * scene.quad_normal[quad]
+        normal[alive[wall]] = -np.sign(approach)[:, None] * scene.quad_normal[number[wall] - fields]
 
         # End where the light is known.
         goes_on = normal[alive].any(axis=1)
