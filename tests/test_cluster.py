@@ -3,6 +3,7 @@
 import os
 import signal
 import sys
+import time
 
 import numpy as np
 import pytest
@@ -51,6 +52,14 @@ def test_without_the_extra_one_sentence_names_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(ig.BadInput, match=r"illumgrid\[dask\]"), clusters.cluster(2):
         pass
+
+
+@pytest.mark.parametrize("address", ["", "nonsense", "host:port", "x://host:1"])
+def test_an_address_that_is_none_is_refused_at_once(address):
+    begun = time.monotonic()
+    with pytest.raises(ig.BadInput, match="tcp://host:8786"), clusters.cluster(address=address):
+        pass
+    assert time.monotonic() - begun < 10  # a client that was never connected takes minutes to close
 
 
 def test_workers_and_dask_are_one_of_two(refuse):

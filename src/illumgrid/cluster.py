@@ -137,6 +137,7 @@ def cluster(
     """
     try:
         from distributed import Client, LocalCluster
+        from distributed.comm import addressing
     except ImportError as reason:
         raise BadInput(f"several workers need dask.distributed ({reason}); pip install 'illumgrid[dask]'") from None
     with ExitStack() as stack:
@@ -147,6 +148,12 @@ def cluster(
             )
             stack.enter_context(local)
             address = local.scheduler_address
+        try:  # before there is a client: one of a malformed address takes minutes to close
+            addressing.get_address_host_port(addressing.normalize_address(address))
+        except ValueError as reason:
+            raise BadInput(
+                f"the address of the dask scheduler is {address!r} ({reason}); expected one such as tcp://host:8786"
+            ) from None
         try:
             client = stack.enter_context(Client(address, timeout=PATIENCE, set_as_default=False))
             client.wait_for_workers(1, timeout=PATIENCE)
