@@ -113,8 +113,9 @@ def test_the_range_leaves_haze_that_the_border_cuts():
     volume = halo()
     faces = np.concatenate([np.take(volume.values, end, axis=axis).ravel() for axis in range(3) for end in (0, -1)])
     assert (faces > 27).mean() > 0.1  # the middle of 13 to 40, where most of the boundaries are
-    low, high, _ = suggest_range(volume)
+    low, high, why = suggest_range(volume)
     assert (faces > low).mean() == pytest.approx(0.05, abs=0.01) and low < high < 0.7 * volume.values.max()
+    assert "begins where the solid has left most of the volume's border" in why  # the boundary named lies below
     opposite = suggest_range(volume.with_stored(-volume.values), "below")
     assert opposite[:2] == pytest.approx((-high, -low), rel=1e-3)
 

@@ -83,6 +83,17 @@ def test_no_light_is_known_first_that_no_path_could_end_in():
     assert [light.recipe["cache"] for light in lights] == [True, False]
 
 
+def test_a_held_level_is_named_as_it_was_given(call, tmp_path):
+    np.save(tmp_path / "v.npy", ball(8).values)
+    text = '[[field]]\nname = "a"\nvolume = "v.npy"\nrange = [0.3, 0.9]\n'
+    held = '[[field]]\nname = "b"\nvolume = "v.npy"\nisovalue = 0.2\n'
+    (tmp_path / "s.toml").write_text(f"{text}{held}")
+    said = call("run", "s.toml", "--grid", 4, "--paths", 1, "--bounces", 0, "--no-preview", "-o", "out")
+    assert "voxels, held at isovalue 0.2\n" in said and "0.19999" not in said and "isovalues 0.3 to 0.9" in said
+    told = call("info", "out")
+    assert "held at          0.2, inside above" in told and "0.19999" not in told
+
+
 def test_levels_that_cannot_be_held_are_refused(tmp_path):
     refused(lambda: Field("a", ball(8), isovalue=9.0), "9", "'a'", "misses")
     np.save(tmp_path / "v.npy", ball(8).values)

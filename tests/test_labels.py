@@ -8,8 +8,11 @@ from typer.testing import CliRunner
 
 from illumgrid.cli import app
 from illumgrid.errors import BadInput
+from illumgrid.field.diagnosis import diagnose
 from illumgrid.field.labels import labels_in
+from illumgrid.field.lattice import nodes_over
 from illumgrid.field.levelset import isosurface
+from illumgrid.field.scene import Field
 from illumgrid.field.volume import Volume
 from illumgrid.io.readers import read_volume
 
@@ -71,6 +74,14 @@ def test_label_maps_are_recognised():
     assert len(labels_in(Volume(many))) > 30
     nested = sum(ball(r, room=16 - r)[0].astype(int) for r in (4, 8, 12))
     assert labels_in(Volume(nested)) == [1, 2, 3]
+
+
+def test_only_a_map_of_several_labels_is_advised_to_light_several():
+    mask = ball(6)[0].astype(np.uint8)
+    for values, several in ((mask, False), (mask + np.roll(mask, 3, axis=0), True)):
+        field = Field("map", Volume(values), range=(0.2, 0.8))
+        found = {one.name: one.sentence for one in diagnose(field, nodes_over(field.volume), flat=[])}
+        assert ("several" in found["labels"]) is several
 
 
 def test_fields_are_not_taken_for_label_maps():

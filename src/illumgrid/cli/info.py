@@ -146,7 +146,9 @@ def _describe_run(source: str) -> None:
     for about in record["scene"]["fields"]:
         lattice, grid = GridSpec(*(about[key] for key in ("shape", *PLACE))), record["grids"][about["name"]]
         _describe_lattice(about["name"], lattice, about["histogram"], about["extremes"], about["unit"])
-        result(f"  range            {shown_range(about['range'], 6)}, inside {about['inside']}")
+        held, swept = about.get("isovalue"), shown_range(about["range"], 6)
+        place = f"range            {swept}" if held is None else f"held at          {held:g}"
+        result(f"  {place}, inside {about['inside']}")
         nodes = " x ".join(map(str, grid["shape"]))
         result(f"  light            {nodes} nodes, {grid['lit']:.1%} with light of their own")
     for quad in record["scene"]["quads"]:

@@ -216,7 +216,9 @@ def run(
             return
         for field in scene.fields:
             shape = " x ".join(map(str, field.volume.shape))
-            say(f"{field.name}: {shape} voxels, isovalues {shown_range(field.range)}")
+            held = field.isovalue is not None
+            swept = f"held at isovalue {field.isovalue:g}" if held else f"isovalues {shown_range(field.range)}"
+            say(f"{field.name}: {shape} voxels, {swept}")
             for finding in diagnose(field, nodes_over(field.volume, grid), smooth or 0.0):
                 tell(finding.name, finding.sentence)
                 if finding.name == "noise" and "noise" not in (ignore or []):

@@ -116,13 +116,22 @@ def _suggest(volume: Volume, inside: Side) -> tuple[float, float, str]:
     outer, inner = np.clip(_around_a_boundary(_density(value), *ends), _INSIDE, 1 - _INSIDE)
     if _thickness(volume, _in_units(volume, inside, [0.5 * (outer + inner)])[0], inside) < _THIN:
         inner = min(inner, 2 * np.sqrt(outer * inner) - outer)
+    begun = outer
     outer, inner = _out_of_haze(volume, inside, value, slope, (outer, inner))
     if inner - outer < _INSIDE:  # a step: its surfaces are the same
         outer, inner = np.clip(0.5 * (outer + inner) + 0.5 * _INSIDE * np.array([-1, 1]), 0, 1)
-    at = [shown(x, volume.extremes, 3) for x in sorted(_in_units(volume, inside, _peaks(_density(value))))]
+    peaks = _peaks(_density(value))
+    at = [shown(x, volume.extremes, 3) for x in sorted(_in_units(volume, inside, peaks))]
     low, high = sorted(_in_units(volume, inside, [outer, inner]))
     plural = "boundaries between classes of the data lie" if len(at) > 1 else "the boundary of the object lies"
-    return low, high, f"{plural} around {', '.join(at)}, where surfaces are steep"
+    why = f"{plural} around {', '.join(at)}, where surfaces are steep"
+    if min(peaks, default=1.0) < outer:  # a reason that the numbers do not contradict
+        why += (
+            "; the range begins where the solid has left most of the volume's border"
+            if outer > begun
+            else f"; the range stays {_INSIDE:.0%} of the span of the data away from their ends"
+        )
+    return low, high, why
 
 
 def _out_of_haze(

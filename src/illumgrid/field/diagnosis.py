@@ -294,10 +294,11 @@ def _border(field: Field) -> Iterator[Finding]:
             touched, total = touched + met, total + plane.size
             if met:
                 faces.append(f"the {side} {letter}")
+    widest = field.widest if field.isovalue is None else field.isovalue
     if touched > _TOUCHED * total:
         yield Finding(
             "border",
-            f"at {shown(field.widest, field.range)} the solid of field {field.name!r} meets the volume's border "
+            f"at {shown(widest, field.range)} the solid of field {field.name!r} meets the volume's border "
             f"({', '.join(faces)} plane, {_below(touched / total)} of the border), where it is cut and closed by a "
             "flat cap; take a larger crop, or a --range farther inside",
         )
@@ -358,8 +359,8 @@ def _labels(field: Field) -> Iterator[Finding]:
         yield Finding(
             "labels",
             f"field {field.name!r} looks like a map of labels ({shown}): its level sets are the faces of voxels, and "
-            f"between two labels lie those of others; --label {labels[0]} lights a smooth surface of one, "
-            f"--label {labels[0]},{labels[-1]} several",
+            f"between two labels lie those of others; --label {labels[0]} lights a smooth surface of one"
+            + (f", --label {labels[0]},{labels[-1]} several" if len(labels) > 1 else ""),
         )
 
 

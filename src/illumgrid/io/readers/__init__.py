@@ -20,7 +20,7 @@ from illumgrid.errors import BadInput, tell
 from illumgrid.field.volume import Volume
 from illumgrid.io.readers.families import EXPECTED, FAMILIES, SUFFIXES, Family, family_of
 from illumgrid.io.readers.scene_file import read_scene
-from illumgrid.io.readers.source import find_source
+from illumgrid.io.readers.source import AGAIN, find_source
 from illumgrid.io.readers.stored import (
     Choice,
     Stored,
@@ -145,6 +145,8 @@ def named(file: Path, expected: str) -> Iterator[str]:
         raise BadInput(f"{shown}: {_printable(str(problem))}") from None
     except MemoryError as problem:
         raise BadInput(f"{shown}: too large for the memory of this machine; expected less; coarsen it") from problem
+    except EOFError as problem:
+        raise BadInput(f"{shown}: ends too early ({_reason(problem)}); {AGAIN}") from problem
     except UNREADABLE as problem:
         raise BadInput(f"{shown}: was not understood ({_reason(problem)}); {expected}") from problem
 
