@@ -258,7 +258,7 @@ def test_run_says_what_would_help_noisy_data(call, tmp_path):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         said = call("run", "noise.npy", "--range", 0.4, 0.7, "--grid", 12, "--no-preview", "-o", "n")
-    assert "note: grid: interpolation between nodes" in said and "--smooth 1" in said
+    assert "note: grid: the interpolation error between nodes" in said and "--smooth 1" in said
 
 
 def test_what_is_foreseen_of_a_grid_is_what_the_grid_will_hold(truth):
@@ -301,7 +301,7 @@ def test_it_reports_where_runs_default_stands(truth):
     own.default, own.built = True, False
     records = [report.record(quick, truths, True), report.record(own, truths, False)]
     said = report.advice(records, PARTS, 5)
-    assert said[1].startswith("run's default (about 15 s, error 20.00%) is beaten by --sampler direct")
+    assert said[1].startswith("run's default (about 15 s, error 20.00%) is dominated by --sampler direct")
     assert "--paths 16 --bounces 5 (1 s, error 9.00%)" in said[1]
     text = table(records)
     assert text.index("the front:") < text.index("run's default:") < text.index("~14.60")

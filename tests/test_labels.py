@@ -114,7 +114,7 @@ def test_run_of_one_and_of_several_labels(tmp_path, monkeypatch):
     assert np.abs(first.material.albedo - second.material.albedo).max() > 0.3
     done = CliRunner().invoke(app, ["info", "a.npy", "--label", "3"])
     assert done.exit_code == 0 and "-1 to 1: a voxel outside" in done.output
-    with pytest.raises(BadInput, match="labels that differ"):
+    with pytest.raises(BadInput, match="different whole numbers"):
         CliRunner().invoke(app, ["info", "a.npy", "--label", "x"], catch_exceptions=False)
     for command in (["info", "a.npy"], ["run", "a.npy", "-o", "below"]):
         with pytest.raises(BadInput, match="--inside and --label came together"):

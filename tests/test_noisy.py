@@ -53,7 +53,7 @@ def test_a_run_of_noisy_data_that_was_stopped_goes_on_to_the_same_bits(call, mon
     monkeypatch.setattr(walk, "PIECE", 600)
     monkeypatch.setattr(partial, "EVERY", 0.0)
     command = ("run", "v.npy", "--range", "0.3", "0.7", "--isovalues", "3", "--bounces", "1", "--no-preview")
-    assert "read by level and normal" in call(*command, "-o", "whole")
+    assert "by level and normal (bilateral)" in call(*command, "-o", "whole")
     real, calls = walk.answer, iter(range(10**6))
 
     def dying(*work):

@@ -129,7 +129,7 @@ def test_more_paths_on_a_finished_run_walk_the_others_only(call, pieces):
     pieces(-1)
     call(*RUN, "--paths", "4", "-o", "out")
     more = pieces(-1)
-    assert "going on with the 4 paths of out" in call(*RUN, "--paths", "8", "-o", "out", "--resume")
+    assert "continuing after the 4 paths of out" in call(*RUN, "--paths", "8", "-o", "out", "--resume")
     weights = {paths.start // 4 for _, paths in more}
     assert {(paths.start, paths.stop) for _, paths in more} == {(4 * w, 8 * w) for w in weights} and 1 in weights
     found = ig.load("out")

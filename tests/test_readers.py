@@ -37,7 +37,7 @@ FORMATS = [
 ]
 
 
-@pytest.mark.filterwarnings("ignore:spacing")  # a TIFF does not say how far its slices are
+@pytest.mark.filterwarnings("ignore:spacing")  # a TIFF does not state the distance between its slices
 @pytest.mark.parametrize(("ending", "dtype"), FORMATS)
 @pytest.mark.parametrize("how", ["plain", "compressed", "gz"])
 def test_round_trip(tmp_path, ending, dtype, how):

@@ -142,7 +142,7 @@ def test_cut_file(tmp_path, ending, capfd):
 def test_tiff_that_itk_would_spoil(tmp_path, options):
     array = values().T.astype(options.pop("dtype", "uint16"))
     tifffile.imwrite(tmp_path / "a.tif", array, photometric="minisblack", **options)
-    with pytest.warns(IllumgridWarning, match="1, 1, 1 was taken"):
+    with pytest.warns(IllumgridWarning, match="1, 1, 1 was assumed"):
         assert np.array_equal(read_volume(tmp_path / "a.tif").values, values())
 
 

@@ -389,7 +389,7 @@ def test_what_the_header_lacks_is_assumed_and_said(tmp_path):
     image(np.moveaxis(HOUNSFIELD, 2, 0).transpose(0, 2, 1), NumberOfFrames=7).save_as(
         tmp_path / "a.dcm", enforce_file_format=True
     )
-    volume = read(tmp_path / "a.dcm", "does not say where its slices lie")
+    volume = read(tmp_path / "a.dcm", "does not state the position of its slices")
     assert np.array_equal(volume.values, HOUNSFIELD) and np.allclose(volume.spacing, 1)
 
 

@@ -171,7 +171,7 @@ def test_no_spacing_is_reported(tmp_path):
         nrrd_head("raw").replace(b"spacings: 1 1 1\n", b"") + b"\n" + values().T.tobytes()
     )
     for name in ("a.mha", "a.nrrd"):
-        with pytest.warns(IllumgridWarning, match=f"spacing: {name}: does not say how far"):
+        with pytest.warns(IllumgridWarning, match=f"spacing: {name}: does not state the distance"):
             read_volume(tmp_path / name)
         read_volume(tmp_path / name, spacing=(1, 1, 2))
 

@@ -65,7 +65,7 @@ def test_axis_order(tmp_path, order):
 
 
 def test_axis_order_of_zeros(tmp_path):
-    with pytest.warns(IllumgridWarning, match="columns, rows, sections were taken"):
+    with pytest.warns(IllumgridWarning, match="columns, rows, sections were assumed"):
         assert np.array_equal(read_volume(saved(tmp_path / "a.map", mapc=0, mapr=0, maps=0)).values, values())
     refused(saved(tmp_path / "a.map", mapc=1, mapr=1, maps=3), "(1, 1, 3)")
 

@@ -37,7 +37,7 @@ def test_ome_calibration(tmp_path):
     tifffile.imwrite(
         file, ZYX, metadata={"axes": "ZYX", "PhysicalSizeX": 0.2, "PhysicalSizeY": 0.2}, photometric="minisblack"
     )
-    with pytest.warns(IllumgridWarning, match=r"spacing: .* along z; 0\.2 was taken"):
+    with pytest.warns(IllumgridWarning, match=r"spacing: .* along z; 0\.2 was assumed"):
         spaced(file, (0.2, 0.2, 0.2), "µm")
 
 
@@ -72,7 +72,7 @@ def test_a_time_series_of_planes_is_taken_for_slices(tmp_path):
 @pytest.mark.parametrize("dpi", [72, 96, 300])
 def test_printing_resolutions_are_no_spacing(tmp_path, dpi):
     tifffile.imwrite(tmp_path / "a.tif", ZYX, resolution=(dpi, dpi), resolutionunit="inch", photometric="minisblack")
-    with pytest.warns(IllumgridWarning, match=f"only {dpi} dots per inch, as for printing; 1, 1, 1 was taken"):
+    with pytest.warns(IllumgridWarning, match=f"only {dpi} dots per inch, as for printing; 1, 1, 1 was assumed"):
         spaced(tmp_path / "a.tif", (1, 1, 1), None)
     assert np.allclose(read_volume(tmp_path / "a.tif", spacing=(1, 2, 3)).spacing, (1, 2, 3))
 
@@ -81,7 +81,7 @@ def test_a_resolution_of_a_microscope(tmp_path):
     tifffile.imwrite(
         tmp_path / "a.tif", ZYX, resolution=(20000, 20000), resolutionunit="centimeter", photometric="minisblack"
     )
-    with pytest.warns(IllumgridWarning, match=r"0\.0005 x 0\.0005 mm for a pixel, .* 0\.0005 mm was taken"):
+    with pytest.warns(IllumgridWarning, match=r"0\.0005 x 0\.0005 mm for a pixel, .* 0\.0005 mm was assumed"):
         spaced(tmp_path / "a.tif", (5e-4, 5e-4, 5e-4), "mm")
 
 
@@ -107,7 +107,7 @@ def test_a_folder_of_slices(tmp_path):
         tifffile.imwrite(
             tmp_path / f"s{k + 8}.tif", ZYX[k], photometric="minisblack", resolution=(5, 5), resolutionunit=3
         )
-    with pytest.warns(IllumgridWarning, match="nothing how far slices are"):
+    with pytest.warns(IllumgridWarning, match="not the distance between slices"):
         assert np.array_equal(read_volume(tmp_path).values, values())  # 8, 9, 10, ...: by number, not by letter
     (tmp_path / "s11.tif").unlink()
     with pytest.warns(IllumgridWarning) as caught:
@@ -122,7 +122,7 @@ def test_a_folder_of_slices(tmp_path):
 def test_pixels_of_imagej_without_a_size_are_1_as_there_and_a_warning_says_so(tmp_path):
     about = {"axes": "ZYX", "spacing": 2, "unit": "um"}
     tifffile.imwrite(tmp_path / "a.tif", ZYX.astype("uint16"), imagej=True, resolution=(0, 0), metadata=about)
-    with pytest.warns(IllumgridWarning, match="does not say how large its pixels are; 1 was taken"):
+    with pytest.warns(IllumgridWarning, match="does not state the size of its pixels; 1 was assumed"):
         volume = read_volume(tmp_path / "a.tif")
     assert volume.spacing.tolist() == [1, 1, 2] and volume.unit == "µm"
 
@@ -209,5 +209,5 @@ def test_stacks_of_metamorph(tmp_path):
     file = stk_file(tmp_path / "a.stk", values(), 0.125, 0.5, "um")
     assert np.array_equal(spaced(file, (0.125, 0.125, 0.5), "µm").values, values())
     stk_file(tmp_path / "b.stk", values(), 1, 0.5, "pixel", calibrated=0)  # numbers that its own flag calls void
-    with pytest.warns(IllumgridWarning, match="does not say how far its voxels are from each other"):
+    with pytest.warns(IllumgridWarning, match="does not state the distance between its voxels"):
         spaced(tmp_path / "b.stk", (1, 1, 1), None)

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from illumgrid.registry import backend, interpolator, sampler
     from illumgrid.transport.samples import Queries, Samples
 
-# Numba refuses to be imported with a number of threads that is none; nothing here uses its threads.
+# Numba refuses to be imported if this is not a valid number of threads; nothing here uses its threads.
 _threads = os.environ.get("NUMBA_NUM_THREADS", "1").strip()
 if not _threads.isdecimal() or int(_threads) < 1:
     del os.environ["NUMBA_NUM_THREADS"]
@@ -77,7 +77,7 @@ _HOME = {name: home for home, names in _HOMES.items() for name in names}
 
 
 def __getattr__(name: str) -> Any:
-    """Import a public name where it is first used, so that ``import illumgrid`` and ``--help`` are quick."""
+    """Import a public name on first use, so that ``import illumgrid`` and ``--help`` are quick."""
     if name == "__version__":
         from importlib.metadata import version
 

@@ -27,14 +27,14 @@ def main() -> None:
 
         command()
     except (KeyboardInterrupt, Exception) as error:  # before the command has begun, or after its end
-        if not came and not isinstance(error, KeyboardInterrupt):  # an import makes another exception of a stop
+        if not came and not isinstance(error, KeyboardInterrupt):  # an import may turn a stop into another exception
             raise
         sentence = getattr(sys.modules.get("illumgrid.cli.stops"), "sentence", None)
         with suppress(OSError, ValueError):
             sys.stdout.flush()
             sys.stderr.write(f"{sentence() if sentence else 'illumgrid: stopped; nothing was written'}\n")
             sys.stderr.flush()
-        os._exit(130)  # Python ends by SIGINT where the stop came within exec, as in the making of a dataclass
+        os._exit(130)  # Python ends by SIGINT if the stop came within exec, as while a dataclass is made
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""From a scene to its light, and from a folder: where names of stages become objects."""
+"""`run` and `load`: from a scene or a folder to its light; names of stages become objects here."""
 
 import operator
 import os
@@ -50,7 +50,7 @@ def _stage(kind: str, given: Any, options: dict[str, Any] | None = None) -> Any:
 
 
 def _stages(sampler: Any, backend: Any, interpolator: Any, isovalues: int | None) -> tuple[Any, Any, Any]:
-    """The three stages; `isovalues`, if given, are the count of a sampler that is named and has one."""
+    """The three stages; `isovalues`, if given, sets the count of a sampler that is given by name and has one."""
     named = isovalues is not None and isinstance(sampler, str)
     options = {"count": isovalues} if named and "count" in registry.option_names("sampler", sampler) else {}
     return _stage("sampler", sampler, options), _stage("backend", backend), _stage("interpolator", interpolator)
@@ -59,7 +59,7 @@ def _stages(sampler: Any, backend: Any, interpolator: Any, isovalues: int | None
 def _check_needs(
     scene: Scene, specs: Sequence[GridSpec], levels: Levels, chosen: tuple[Any, Any, Any], *, held: bool, refining: bool
 ) -> None:
-    """Refuse what needs more memory than there is."""
+    """Refuse a run that needs more memory than is free."""
     at_nodes = not held and chosen[0].name == "direct" and chosen[2].name in ("nearest", "bilateral")
     density = getattr(chosen[2], "density", 1.0)
     needs.check_run(scene, specs, levels, density, at_nodes=at_nodes, refining=refining)
@@ -94,25 +94,26 @@ def run(
     ----------
     scene : Scene
     sampler, backend, interpolator : str or stage
-        Names, or stage objects such as ``illumgrid.sampler("uniform", count=64)``. Without `grid` and walls, under
-        several lights, noisy data (`illumgrid.field.diagnosis.noisy`) are read by ``bilateral`` of density 1 in place
-        of ``nearest``.
+        Names, or stage objects such as ``illumgrid.sampler("uniform", count=64)``. For noisy data
+        (`illumgrid.field.diagnosis.noisy`) under several lights, without `grid` and walls, ``bilateral`` of density 1
+        replaces ``nearest``.
     grid : int, optional
-        Nodes along the axis with most voxels, all of which are lit. By default 1.2 for each voxel, at most 150; under a
-        sky alone 0.85, and twice or four times as many where a first look finds rough light: see
-        `illumgrid.bake.refined.chosen`.
+        Nodes along the axis with most voxels; every node near an isosurface of the range is lit. By default 1.2 per
+        voxel, at most 150; under a sky alone 0.85, with half or a quarter of that spacing where a first look finds
+        rough light: see `illumgrid.bake.refined.chosen`.
     paths : int, optional
-        Light paths from every query; by default 32; 8 to 64 where a first look chooses the nodes,
-        16 where noisy data are read by level and normal.
+        Light paths per query; by default 32; 8 to 64 if a first look chooses the nodes, 16 for noisy data with
+        ``bilateral``.
     bounces : int, optional
         Reflections; 0 is light straight from background and lamps. By default as many as leave out less than 1 % of
-        the light, and at least 8; paths end in the light of the first look where that is known well, or, where it
-        takes more bounces, in a coarse grid that is lit first: see `illumgrid.bake.known.light_known_first`. A number
-        given here is followed path by path.
+        the light, and at least 8; paths may then end in the light of the first look, or, where light needs more than 4
+        bounces, in a coarse grid that is lit first: see `illumgrid.bake.known.light_known_first`. If a number is given,
+        every path is followed for that many reflections.
     isovalues : int, optional
         Rows of the level table, 32 by default; if given, also the count of a sampler that is named and has one.
     texels : int, optional
-        Along the longest edge of all walls; by default those of the scene, or with `error` as many as it takes.
+        Texels along the longest edge of all walls; by default those of the scene, or with `error` as many as it
+        needs.
     seed : int
         Equal seeds give bit-identical grids, on any number of threads.
     error : float, optional
@@ -120,15 +121,15 @@ def run(
         are not given, for the least time. Needs the sampler `direct`, the interpolator `nearest` and a backend that
         marches level sets, whose error is known before the grid is built.
     seconds : float, optional
-        In place of `error`: time to use, for the least error.
+        Instead of `error`: computing time in seconds, used for the least error.
     judge : bool
-        Whether to measure the error reached when the light is done: see `judged`.
+        Whether to measure the error reached at the end: see `judged`.
     map : callable, optional
-        What spreads the work: see `illumgrid.bake.bake`.
+        Applies a function to pieces of work, like the built-in ``map``: see `illumgrid.bake.bake`.
     progress : callable, optional
         Called with (what, done, total).
     keep : RunKeeper, optional
-        Keeps the light that is finished; what the run that it goes on with had chosen is taken over.
+        Keeps finished light. A resumed run takes over what the earlier one had chosen.
 
     Returns
     -------
@@ -173,7 +174,7 @@ def run(
     if by_normal:
         chosen = chosen[0], chosen[1], BY_NORMAL[0]
     specs = specs_over(scene, grid, BASE) if refining else specs_over(scene, grid)
-    held = any(field.isovalue is not None for field in scene.fields)  # such rows are in no cache's sweep
+    held = any(field.isovalue is not None for field in scene.fields)  # the rows of a held level are in no cache's sweep
     _check_needs(scene, specs, levels, chosen, held=held, refining=bool(refining))
     automatic = bounces is None or cached
     if bounces is None:
@@ -195,7 +196,7 @@ def run(
         fixed = None if isinstance(walked, Iterator) else max(r.stop for r in walked)
         about = {"cache": ahead.cached, "grid": grid, "bounces": bounces, "left_out": left_out, "paths": fixed}
         keep.choose({**about, "refined": ahead.refined, "by_normal": bool(by_normal), "plan": plan})
-    ending, ahead = [ahead.tracer], replace(ahead, tracer=tracer)  # light that paths end in goes when they are walked
+    ending, ahead = [ahead.tracer], replace(ahead, tracer=tracer)  # frees the light that paths end in
     baked = bake(
         scene, ahead.specs, levels, ahead.sampler, ending.pop(), ahead.interpolator,
         paths=walked, bounces=bounces, seed=seed, map=map, progress=progress, keep=keep,
@@ -210,7 +211,7 @@ def run(
 def _planned(
     scene: Scene, tracer: Tracer, levels: Levels, progress: Progress, **asked: Any
 ) -> tuple[dict[str, Any], Ahead | None]:
-    """What a pilot chooses for an error or a time, as `planned` has it; what the user should know is said."""
+    """What a pilot chooses for an error or a time, see `planned`; warns of what the user should know."""
     progress("pilot", 0, 1)
     plan, ahead = planned(scene, tracer, levels, **asked)
     progress("pilot", 1, 1)
@@ -223,7 +224,7 @@ def _paths_of(
     before: dict[str, Any] | None, plan: Any, paths: int | None, error: float | None, seconds: float | None,
     begun: float, few: int,
 ) -> Iterable[range]:  # fmt: skip
-    """Numbers of the paths to walk: `few` where nothing else is said."""
+    """Ranges of paths to trace: `few` unless something else is requested."""
     if before:
         return _gone_on_with(before, None if error or seconds else paths or usual_paths(before))
     if plan and seconds is not None and paths is None:
@@ -232,7 +233,7 @@ def _paths_of(
 
 
 def usual_paths(before: dict[str, Any]) -> int:
-    """Paths of a run that goes on where no number is asked for: those that it has chosen by itself, or the default."""
+    """Paths of a resumed run if no number is requested: those that it had chosen by itself, or the default."""
     chosen: int = before["paths"] if before.get("refined") or before.get("by_normal") else PATHS
     return chosen
 
@@ -251,7 +252,7 @@ def _whole_numbers(paths: Any, bounces: Any, seed: Any) -> tuple[int | None, int
 
 
 def _whole(number: Any, least: int, limit: int, sentence: str) -> int:
-    """A whole number from `least` up to, not with, `limit`, of any integer type; or `BadInput`."""
+    """A whole number of any integer type, at least `least` and below `limit`; otherwise `BadInput`."""
     try:
         whole = operator.index(number)
     except TypeError:
@@ -273,7 +274,7 @@ def _note_holes(scene: Scene, baked: Baked) -> None:
 
 
 def _chosen(stages: Sequence[Any], ahead: Ahead, looked_at: Sequence[GridSpec]) -> dict[str, Any]:
-    """What the recipe says about the stages and the nodes, which a first look at a lattice may have chosen."""
+    """The part of the recipe about the stages and the nodes, which a first look at a lattice may have chosen."""
     kinds = zip(("sampler", "backend", "interpolator"), (*stages[:2], ahead.interpolator))
     return {
         **{kind: _described(stage) for kind, stage in kinds},
@@ -284,7 +285,7 @@ def _chosen(stages: Sequence[Any], ahead: Ahead, looked_at: Sequence[GridSpec]) 
 
 
 def _measured(baked: Baked, first: dict[str, float]) -> dict[str, Any]:
-    """What the recipe says about how the light came about; `first` is the time of what came before the bake."""
+    """The part of the recipe about the computation; `first` is the time spent before the bake."""
     return {
         "paths": baked.paths,
         "queries": baked.queries,
@@ -293,7 +294,7 @@ def _measured(baked: Baked, first: dict[str, float]) -> dict[str, Any]:
         "holes": list(baked.holes),
         "seconds": {stage: round(seconds, 3) for stage, seconds in {**first, **baked.seconds}.items()},
         "relative_error": [grid.relative_error for grid in baked.grids],
-        **dict.fromkeys(("reached", "reached_uncertain", "reached_on_walls")),  # not judged
+        **dict.fromkeys(("reached", "reached_uncertain", "reached_on_walls")),  # error not measured
         "versions": {name: version(name) for name in ("illumgrid", "numpy", "numba", "scipy")},
     }
 
@@ -302,8 +303,8 @@ def judged(light: Illumination, backend: Backend, tracer: Tracer | None = None) 
     """The same light with the error that it reached in its recipe; never raises.
 
     ``reached`` is the relative root mean square error at points that the run did not ask for, ``reached_uncertain`` its
-    standard error, and ``reached_on_walls`` that error on walls. A result is judged on its own surface or not at all:
-    all are None for a backend that traces meshes or computes no light transport, and in the dark.
+    standard error, and ``reached_on_walls`` that error on walls. The error is measured on the trilinear surface only:
+    all three are None for a backend that traces meshes or computes no light transport, and for a scene without light.
 
     Parameters
     ----------
@@ -319,7 +320,7 @@ def judged(light: Illumination, backend: Backend, tracer: Tracer | None = None) 
         can = capabilities(backend)
         if not can.transport or can.surface != "levelset":
             return light
-        quick = registry.backend("auto")  # of the same surface
+        quick = registry.backend("auto")  # on the same surface
         if tracer is None or quick != backend:
             tracer = prepare(quick, light.scene)
 
@@ -330,7 +331,7 @@ def judged(light: Illumination, backend: Backend, tracer: Tracer | None = None) 
         found = off(unseen_in_volume, lambda asked: look_up(light.grids, asked)[0], "queries", "paths")
         held = partial(look_up_walls, light.scene, light.walls)
         on_walls = off(unseen_on_walls, held, "texels", "texel_paths") if light.walls else None
-    except Exception as reason:  # a finished run is worth more than its judgement
+    except Exception as reason:  # a failing measurement must not fail a finished run
         tell_after(
             "error", f"the error reached could not be measured ({type(reason).__name__}: {reason})", stacklevel=2
         )
@@ -343,7 +344,7 @@ def judged(light: Illumination, backend: Backend, tracer: Tracer | None = None) 
 
 
 def _gone_on_with(before: dict[str, Any], paths: int | None) -> list[range]:
-    """Ranges of paths of a run that was stopped, or of a finished one, and as many more as are asked for now."""
+    """Ranges of paths of an earlier run, stopped or finished, and those that are requested in addition."""
     ranges = [range(start, stop) for start, stop in before.get("walked", ())]
     done, asked = max((r.stop for r in ranges), default=0), paths or before["paths"] or 0
     return [*ranges, range(done, asked)] if asked > done else ranges
@@ -354,7 +355,7 @@ def _shines(scene: Scene) -> bool:
 
 
 def rounds(paths: int, fill: float, until: float, clock: Callable[[], float] = time.perf_counter) -> Iterator[range]:
-    """Paths for a run that is to end at a time: a quarter of the plan's, then as many as their pace leaves time for.
+    """Ranges of paths for a run with a time limit: a quarter of the plan, then as many as the pace leaves time for.
 
     The probe times a few thousand paths, which is good enough to choose a grid but, on a machine that does other things
     as well, not to promise a time.
@@ -369,7 +370,7 @@ def rounds(paths: int, fill: float, until: float, clock: Callable[[], float] = t
 
 
 def _check_plannable(error: float | None, seconds: float | None, sampler: Any, backend: Any, interpolator: Any) -> None:
-    """Refuse what no pilot can plan for."""
+    """Refuse a request for which no pilot can plan."""
     if error is not None and seconds is not None:
         raise BadInput("both an error and a time were asked for; expected one of them")
     if error is not None and not 0 < error < 1:

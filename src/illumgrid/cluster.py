@@ -25,7 +25,7 @@ PATIENCE = 30.0
 
 
 def machine() -> dict[str, str]:
-    """What decides the last digits of light on this machine."""
+    """Properties of this machine that determine the last digits of light."""
     from llvmlite.binding import get_host_cpu_name
 
     versions = {name: version(name) for name in ("illumgrid", "numba", "numpy", "scipy")}
@@ -33,7 +33,7 @@ def machine() -> dict[str, str]:
 
 
 def _work(function: Callable[[Any], Any], piece: Any, expected: dict[str, str] | None) -> Any:
-    """Do a piece of work, on a worker."""
+    """Do a piece of work on a worker."""
     if expected is not None and (other := _other(machine(), expected)):
         raise BadInput(f"a worker on {platform.node()} has {other}; {_REMEDY}")
     return function(piece)
@@ -43,7 +43,7 @@ _REMEDY = "expected the same on all, for the same bits; any_machine=True accepts
 
 
 def _other(found: dict[str, str], expected: dict[str, str]) -> str:
-    """In what two machines differ, as text; empty if in nothing."""
+    """The differences between two machines, as text; empty if there are none."""
     return ", ".join(
         f"{key} {found.get(key)} (here {expected[key]})" for key in expected if found.get(key) != expected[key]
     )
@@ -100,7 +100,7 @@ class ClusterMap:
 
 
 def _lost() -> tuple[type[BaseException], ...]:
-    """What dask raises when something went with a worker."""
+    """The exceptions that dask raises when a worker was lost with its data."""
     from concurrent.futures import CancelledError
 
     from distributed.client import FutureCancelledError

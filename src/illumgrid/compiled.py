@@ -1,4 +1,4 @@
-"""Compilation by Numba with a cache on disk that costs time where it fails, and never the run.
+"""Compilation by Numba with a cache on disk whose failures cost time, and never the run.
 
 Numba alone refuses to compile where it may write nowhere, and raises whatever a damaged file of its cache makes of it;
 it does not notice damage within machine code. And it optimises a function, with all that it calls, and makes machine
@@ -24,13 +24,13 @@ from numba.core.serialize import dumps
 from illumgrid.errors import tell
 
 log = logging.getLogger(__name__)
-"""Has the name of each function as its compilation begins."""
+"""Logs the name of each function when its compilation begins."""
 
 _said: set[str] = set()
 
 
 def _say(what: str, problem: Exception) -> None:
-    """Say once in a process that the cache is of no use."""
+    """Warn once per process that the cache cannot be used."""
     if what not in _said:
         _said.add(what)
         reason = " ".join(str(problem).split())[:160] or type(problem).__name__
@@ -41,24 +41,24 @@ class _Summed(CompileResultCacheImpl):
     """Compiled code with a checksum."""
 
     def reduce(self, compiled: Any) -> tuple[bytes, bytes]:
-        """What is kept."""
+        """The data that are kept."""
         content = dumps(super().reduce(compiled))
         return content, hashlib.sha256(content).digest()
 
     def rebuild(self, context: Any, kept: tuple[bytes, bytes]) -> Any:
-        """From what is kept."""
+        """Restore from the data that were kept."""
         content, digest = kept
         if hashlib.sha256(content).digest() != digest:
             raise ValueError("its checksum is another")
         return super().rebuild(context, pickle.loads(content))
 
     def get_filename_base(self, name: str, flags: str) -> str:
-        """A name that the files of Numba do not have."""
+        """A name that no file of Numba has."""
         return f"{super().get_filename_base(name, flags)}.summed"
 
 
 class _Cache(FunctionCache):
-    """A cache whose trouble is said and passed over."""
+    """A cache whose failures cause a warning and are then ignored."""
 
     _impl_class = _Summed
 
@@ -67,7 +67,7 @@ class _Cache(FunctionCache):
         try:
             if (kept := super().load_overload(signature, context)) is not None:
                 return kept
-        except Exception as problem:  # whatever unpickling makes of damaged bytes
+        except Exception as problem:  # unpickling damaged bytes can raise anything
             _say("compiled code on the disk cannot be read and is made anew", problem)
             with contextlib.suppress(OSError):
                 self.flush()
@@ -78,12 +78,12 @@ class _Cache(FunctionCache):
         """Keep compiled code, if that is possible."""
         try:
             super().save_overload(signature, compiled)
-        except Exception as problem:  # the disk is full, the folder is gone or not ours
+        except Exception as problem:  # the disk is full, or the folder is gone or not writable
             _say("compiled code cannot be kept on the disk", problem)
 
 
 class _Part(JITCodeLibrary):
-    """Code that waits to be linked into that of an entrance: not optimised as a whole, and no machine code."""
+    """Code to be linked into that of an entrance: not optimised by itself, and without machine code."""
 
     def _optimize_final_module(self) -> None:
         pass
@@ -93,21 +93,21 @@ class _Part(JITCodeLibrary):
         self._finalized = True
 
     def get_pointer_to_function(self, name: str) -> int:
-        """No address: as Numba says of what has no machine code."""
+        """No address: what Numba returns for code without machine code."""
         return 0
 
     def serialize_using_object_code(self) -> Any:
-        """What is kept on the disk."""
+        """The data that are kept on the disk."""
         return self.serialize_using_bitcode()
 
 
 class _Parts(JITCPUCodegen):
-    """Numba's own compiler, but that it makes parts."""
+    """Numba's own compiler, except that it makes parts."""
 
     _library_class = _Part
 
     def set_env(self, name: str, env: Any) -> None:
-        """Nothing: only code that calls Python, which no part does, asks for its environment."""
+        """Do nothing: only code that calls Python needs an environment, and no part does."""
 
 
 def _parts(codegen: Any) -> Any:
@@ -127,10 +127,10 @@ class PartCompiler(Compiler):
 
 
 class _PartSummed(_Summed):
-    """Of code without an entrance from Python, which must not be taken for code that has one."""
+    """Code without an entrance from Python, stored so that it is not taken for code with one."""
 
     def rebuild(self, context: Any, kept: tuple[bytes, bytes]) -> Any:
-        """From what is kept, as a part again."""
+        """Restore as a part."""
         return super().rebuild(context.subtarget(_internal_codegen=_parts(context.codegen())), kept)
 
     def get_filename_base(self, name: str, flags: str) -> str:
@@ -143,7 +143,7 @@ class _PartCache(_Cache):
 
 
 class _Kernel(CPUDispatcher):
-    """A function that compiled code calls; `entrance` compiles it once more where Python calls it.
+    """A function that compiled code calls; `entrance` compiles it once more if Python calls it.
 
     An entrance holds a copy of the function, optimised together with what it calls.
     """
@@ -160,7 +160,7 @@ class _Kernel(CPUDispatcher):
 
 
 def _kept(dispatcher: Any, cache: type[_Cache]) -> Any:
-    """The dispatcher, with a cache on the disk where that is possible."""
+    """The dispatcher with a cache on the disk, if that is possible."""
     try:
         dispatcher._cache = cache(dispatcher.py_func)  # as its method enable_caching does
     except (RuntimeError, OSError) as problem:
@@ -169,7 +169,7 @@ def _kept(dispatcher: Any, cache: type[_Cache]) -> Any:
 
 
 def njit(**options: Any) -> Callable[[Any], Any]:
-    """Compile a function, and keep what comes out on the disk where that is possible.
+    """Compile a function, and keep the result on the disk if that is possible.
 
     No fastmath: what is computed must not depend on the processor, and infinity means something.
     """

@@ -1,4 +1,4 @@
-"""What went wrong, said in one sentence: what came, what was expected, what to do."""
+"""Errors and warnings, each in one sentence: what was given, what was expected, what to do."""
 
 import math
 import warnings
@@ -6,11 +6,11 @@ from collections.abc import Iterable
 
 
 class BadInput(ValueError):
-    """The caller's input cannot be used; the message says what came, what was expected and what to do."""
+    """The input cannot be used; the message states what was given, what was expected and what to do."""
 
 
 class IllumgridWarning(UserWarning):
-    """The result stands, but it is worth knowing this about it.
+    """The result is valid, with a limitation that the message states.
 
     The message begins with the warning's name and a colon: ``warnings.filterwarnings("ignore", "plateau:")`` switches
     one off by name, as ``--ignore plateau`` does on the command line.
@@ -45,7 +45,7 @@ WARNINGS = {
 
 
 def shown(number: float, among: Iterable[float] = (), digits: int = 4) -> str:
-    """A number as text, with as many digits as it takes to tell it from those `among` which it stands.
+    """A number as text, with enough digits to distinguish it from those `among` which it is shown.
 
     101325 among 101320 and 101330 takes seven: a hundredth of what they span.
     """
@@ -57,7 +57,7 @@ def shown(number: float, among: Iterable[float] = (), digits: int = 4) -> str:
 
 
 def shown_range(ends: Iterable[float], digits: int = 4) -> str:
-    """Two numbers as text, "LOW to HIGH", with digits enough to differ."""
+    """Two numbers as text, "LOW to HIGH", with enough digits to differ."""
     low, high = ends
     return f"{shown(low, (high,), digits)} to {shown(high, (low,), digits)}"
 
@@ -69,7 +69,7 @@ def tell(name: str, sentence: str, stacklevel: int = 1) -> None:
 
 
 def tell_after(name: str, sentence: str, stacklevel: int = 1) -> None:
-    """As `tell`, about a finished result, which is kept: where warnings are errors, this one is only shown."""
+    """As `tell`, about a finished result: it only prints if warnings are errors, so that the result is kept."""
     try:
         tell(name, sentence, stacklevel + 1)
     except IllumgridWarning:

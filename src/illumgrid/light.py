@@ -39,13 +39,13 @@ class Illumination:
     levels : Levels
         The table of isovalues.
     grids : tuple of IlluminationGrid
-        One a field.
+        One per field.
     walls : tuple of WallTexture
-        One a quad.
+        One per quad.
     recipe : mapping
-        How it was computed: stages, paths, seconds, versions; all of it JSON.
+        How it was computed: stages, paths, seconds, versions; in types of JSON.
     weights : mapping
-        What `mix` multiplied lights by.
+        Weights of the lights, set by `mix`.
     """
 
     scene: Scene
@@ -66,7 +66,7 @@ class Illumination:
         Parameters
         ----------
         **weights : float
-            By the name of a light, relative to the scene; a light that is left out keeps its weight. Names that are no
+            By the name of a light, relative to the scene; a light that is left out keeps its weight. Names that are not
             Python words: ``light.mix(**{"my lamp": 0.5})``.
 
         Returns
@@ -98,7 +98,7 @@ class Illumination:
         sky : Sky, Distant or None
             As smooth as the harmonics can show it; None is the light of the scene.
         turn : float
-            Degrees about up: by 90, what is in the back of the sky comes to the right.
+            Degrees about up; 90 moves what was behind the object to its right.
 
         Raises
         ------
@@ -119,7 +119,7 @@ class Illumination:
     def looking(
         self, field: str | None = None, *, roughness: float | None = None, translucent: float = 0.0
     ) -> "Illumination":
-        """The same light, with a clear coat over a field or a surface that is seen through: pictures only.
+        """The same light with other looks of a field, in pictures only: a clear coat, translucency.
 
         Parameters
         ----------
@@ -157,7 +157,7 @@ class Illumination:
             return 1.0
         lamps = any(quad.material.emission.any() for quad in self.scene.quads)
         directed = not lamps and any(isinstance(one, Distant) for one in self.scene.lights)
-        # One after the other and in place: both together, with copies, would be as much as the light itself.
+        # One after the other and in place: together and with copies they would need as much memory as the light.
         mean = self._of_lit(lambda lit, albedo: lit.mean(axis=1), np.empty(count, np.float32))
         median = float(np.median(mean, overwrite_input=True))
         del mean
@@ -165,7 +165,7 @@ class Illumination:
         return tone.exposure_under(median, brightest, directed)
 
     def _of_lit(self, worth: Callable[[Any, Any], Any], out: NDArray[Any]) -> NDArray[Any]:
-        """A number for each node that has light of its own, from the light (n, 3) of some and their albedo."""
+        """A number for each node that has light of its own, computed in parts from their light (n, 3) and albedo."""
         first = 0
         for field_, grid in zip(self.scene.fields, self.grids):
             for lit in grid.lit_parts():
@@ -176,7 +176,7 @@ class Illumination:
 
     @cached_property
     def marchable(self) -> Marchable:
-        """The scene laid out for rays, for all pictures."""
+        """The scene laid out for rays, shared by all pictures."""
         return marchable(self.scene)
 
     def color(self, points: ArrayLike, field: str | None = None, exposure: float | None = None) -> NDArray[np.uint8]:
@@ -210,7 +210,7 @@ class Illumination:
     def bake(
         self, mesh: "trimesh.Trimesh", field: str | None = None, isovalue: float | None = None
     ) -> "trimesh.Trimesh":
-        """A copy of a mesh with light at its vertices: decimate or smooth first, light afterwards.
+        """A copy of a mesh with light at its vertices, such as an isosurface that was decimated or smoothed.
 
         Parameters
         ----------
@@ -293,15 +293,15 @@ class Illumination:
         ----------
         folder : str or path-like
         preview : bool
-            Whether with a picture.
+            Whether to draw a picture.
         overwrite : bool
         source : illumgrid.io.elsewhere.Source, optional
-            The file that the fields come from: the folder then refers to it in place of holding them.
+            The file that the fields come from: the folder then refers to it instead of storing them.
 
         Raises
         ------
         BadInput
-            If the folder holds a finished run and not `overwrite`, or anything that is not ours.
+            If the folder holds a finished run without `overwrite`, or anything that is not part of a run.
         """
         from illumgrid.io import store
         from illumgrid.io.record import Stored

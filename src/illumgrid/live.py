@@ -1,8 +1,8 @@
-"""Light that is looked at while it is computed: coarse everywhere at first, then where one looks.
+"""Light that is shown while it is computed: coarse everywhere at first, then refined where the page looks.
 
-`Live` stands between a run and what keeps it: it chooses the next piece of work by what the page shows, and holds the
-light that is there as textures, of which the page asks for what is new. Where a node has no light of its own yet, it
-has that of a lattice of every fourth node, which is lit first.
+`Live` stands between a run and its keeper: it chooses the next piece of work by what the page shows, and holds the
+finished light as textures, whose news the page requests. A node without light of its own has that of the coarse lattice
+of every fourth node, which is lit first.
 """
 
 import json
@@ -28,7 +28,7 @@ from illumgrid.transport.samples import Queries, Samples
 from illumgrid.transport.walk import Answer, Chooser
 
 MOST = 1 << 24
-"""Bytes of one answer to the page, and a box of every texture's share of a piece."""
+"""Bytes of one answer to the page, in boxes that each hold one texture's share of a piece."""
 _APART = np.array([1e3, 1.0, 1.0])
 """Between rows and texels of a wall, for the distance to what is lit: a row shows its own light."""
 OUTSIDE, BEHIND = 0.25, 0.05
@@ -36,12 +36,12 @@ OUTSIDE, BEHIND = 0.25, 0.05
 
 
 class Stopped(Exception):
-    """The person who looked has left."""
+    """Nobody looks any more."""
 
 
 @dataclass(frozen=True)
 class Attention:
-    """What the page shows: a place of the sweep, and an eye and its direction in the coordinates of the stage."""
+    """What the page shows: a position of the sweep, and an eye and its direction in the coordinates of the stage."""
 
     sweep: float = 0.5
     eye: Floats | None = None
@@ -50,7 +50,7 @@ class Attention:
 
     @classmethod
     def of(cls, asked: Mapping[str, Sequence[str]]) -> "Attention":
-        """As an address says it; what is not understood is left out."""
+        """From the query of an address; what is not understood is ignored."""
         try:
             numbers = {key: np.array(asked[key][0].split(","), float) for key in ("sweep", "eye", "forward", "slope")}
         except (KeyError, ValueError):
@@ -76,27 +76,27 @@ class Attention:
 
 @dataclass(eq=False)
 class _Places:
-    """Where the light of each row goes, and whether it is of the coarse lattice."""
+    """Where the light of each row goes, and whether the row belongs to the coarse lattice."""
 
     target: NDArray[np.int32]
-    texture: NDArray[np.int64]  # number of its texture, -1 for what is not shown before the end
+    texture: NDArray[np.int64]  # number of its texture, -1 if it is not shown before the end
     flat: NDArray[np.int64]
     first: NDArray[np.bool_]
 
 
 @dataclass(eq=False)
 class _Blocks:
-    """What decides when a row is asked for, once the coarse lattice is lit."""
+    """What determines when a row is lit, once the coarse lattice is lit."""
 
     block: NDArray[np.int64]  # of each row
-    low: Floats  # of each block: where in the sweep it is seen
+    low: Floats  # of each block: the part of the sweep in which it is visible
     high: Floats
     middle: Floats
 
 
 @dataclass(eq=False)
 class Live:
-    """Light as it comes in: a keeper that chooses what is next, and answers the page.
+    """Light as it comes in: a keeper that chooses the next piece, and answers the page.
 
     Parameters
     ----------
@@ -186,7 +186,7 @@ class Live:
             raise Stopped
 
     def _hand_on(self) -> None:
-        """Let the keeper have what came in."""
+        """Give the keeper the answers that came in."""
         if self._waiting:
             self._waiting()
             self._waiting = None
@@ -211,7 +211,7 @@ class Live:
     # --- what is next --------------------------------------------------------------------------------------------
 
     def next(self, unknown: NDArray[np.bool_], most: Sequence[int]) -> tuple[int, NDArray[np.int64]]:
-        """The batch of the next piece and targets of it: the coarse lattice, then blocks that are looked at."""
+        """The batch of the next piece and its targets: the coarse lattice first, then blocks by `_delays`."""
         rows = np.flatnonzero(unknown)
         first = rows[:0] if self._places is None else rows[self._places.first[rows]]
         late = None if first.size else self._delays()
@@ -226,7 +226,7 @@ class Live:
         return number, own - begin
 
     def _delays(self) -> Floats:
-        """For each row how late it comes."""
+        """For each row, how late it is lit."""
         looked, places = self.attention, self._places
         if places is None:
             raise RuntimeError("nothing was begun")
@@ -235,12 +235,12 @@ class Live:
         if self._late is None or self._late[0] is not looked:
             blocks = self._blocks
             delay = looked.delay(blocks.low, blocks.high, blocks.middle)[blocks.block]
-            delay[places.texture < 0] += 10.0  # levels that are held: when the rest is there
+            delay[places.texture < 0] += 10.0  # levels that are held: after everything else
             self._late = looked, delay
         return self._late[1]
 
     def _placed(self, targets: Sequence[Queries]) -> _Places:
-        """Where rows are shown, and which come first; quickly, since the first picture waits for it."""
+        """Where rows are shown, and which come first. Must be quick, since the first picture waits for it."""
         count = self._batches[-1]
         texture, flat, coarse = np.full(count, -1, np.int64), np.zeros(count, np.int64), np.zeros(count, bool)
         whose = np.concatenate([np.zeros(0, np.int32), *(queries.target for queries in targets)])
@@ -259,7 +259,7 @@ class Live:
         return _Places(whose, texture, flat, coarse)
 
     def _blocked(self, places: _Places) -> _Blocks:
-        """Blocks of rows, and where they are seen."""
+        """The blocks of rows, and where they are visible."""
         stage, fields, rows = Stage.of(self.scene), len(self.specs), len(self.levels.table)
         count, blocks = self._batches[-1], 0
         block = np.full(count, -1, np.int64)
@@ -281,7 +281,7 @@ class Live:
         return _Blocks(block, *_of_blocks(block, blocks, low, high, middle))
 
     def _seen(self, number: int, flat: NDArray[np.int64]) -> tuple[Floats, Floats]:
-        """Where in the sweep nodes are seen, and where they lie: whole queries, with normals, would take seconds."""
+        """Where in the sweep nodes are visible, and their positions; whole queries would take seconds."""
         field, points = self.scene.fields[number], self.specs[number].nodes(flat)
         level = interpolate(field.volume, world_to_index(field.volume, points))
         return field.place(np.clip(level, *field.range)), points
@@ -309,7 +309,7 @@ class Live:
                 self.coarse.set()
 
     def _fill(self) -> None:
-        """Give all nodes light, once: the page, which begins with the coarse lattice, does not wait for it."""
+        """Fill all nodes with coarse light, once; the page, which begins with the coarse nodes, need not wait."""
         if self._filled or not self.coarse.is_set():
             return
         self._filled = True
@@ -318,11 +318,11 @@ class Live:
 
     @property
     def share(self) -> float:
-        """Of all targets, those that are lit."""
+        """Share of all targets that are lit."""
         return 1 - self._left / max(self._batches[-1], 1)
 
     def light(self) -> tuple[Illumination, Coming]:
-        """Light on the coarse lattice, as a page begins with it, and what is to come; its errors are not known yet."""
+        """The light of the coarse lattice, with which a page begins, and what is to come; errors are not known yet."""
         channels = GREY if channels_of(self.scene).grey else RGB
         with self._lock:
             fields = self._textures[: len(self.specs)]

@@ -1,4 +1,4 @@
-"""Light in a notebook that comes while one looks: coarse at once, then finer where it is looked at."""
+"""Light in a notebook while it is computed: coarse at once, then refined where somebody looks."""
 
 import threading
 from collections.abc import Sequence
@@ -21,7 +21,7 @@ from illumgrid.transport.walk import Answer
 
 @dataclass
 class _Nothing:
-    """A keeper of runs that are not kept."""
+    """A keeper for runs that are not kept."""
 
     at_once: bool = True
     chosen: dict[str, Any] | None = None
@@ -39,7 +39,7 @@ class _Nothing:
         """See `illumgrid.transport.walk.Keeper`."""
 
     def settle(self) -> None:
-        """Nothing waits to be kept."""
+        """Nothing is waiting to be kept."""
 
     def flush(self) -> None:
         """See `illumgrid.transport.walk.Keeper`."""
@@ -99,14 +99,14 @@ class Lighting:
             self._problem = problem
 
     def _wait(self, what: str, done: int, total: int) -> None:
-        """The view is made, by all processors, before more is lit."""
+        """Wait until the view is made, by all processors, before more nodes are lit."""
         while self._live.coarse.is_set() and not self._live.stop.is_set() and not self._made.wait(0.05):
             pass
         if self._live.stop.is_set() and not self._live.ended:
             raise Stopped
 
     def _news(self, question: str) -> bytes:
-        """What a view asks for."""
+        """The answer to a view's question."""
         if self._problem:
             raise self._problem
         return self._live.news(parse_qs(question))
@@ -125,7 +125,7 @@ class Lighting:
         return self.light
 
     def stop(self) -> None:
-        """End the run; what is lit stays visible."""
+        """Stop the run; the finished light stays visible."""
         self._live.stop.set()
         self._made.set()
         self._thread.join()

@@ -1,4 +1,4 @@
-"""All that the author of a stage imports: the Protocols, the hooks, and the types that they speak of."""
+"""Everything that the author of a stage imports: the protocols, the hooks, and the types that they use."""
 
 from illumgrid.transport.stages import (
     CONTRACT,

@@ -1,4 +1,4 @@
-"""From linear light to what a screen shows: exposure, tone curve, sRGB; the only place where light is clamped."""
+"""Exposure, tone curve and sRGB: from linear light to display values, the only place where light is clamped."""
 
 import numpy as np
 from numpy.typing import NDArray

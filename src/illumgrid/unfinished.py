@@ -1,4 +1,4 @@
-"""A run on its way as light to look at: what is finished is lit, from coarse to fine, and what is not is striped."""
+"""An unfinished run as light to look at: finished parts are lit, from coarse to fine, all others are striped."""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -28,13 +28,13 @@ from illumgrid.transport.stages import fill_nodes
 from illumgrid.transport.walk import Answer, in_order, split
 
 REACH = 3.5
-"""Nodes to which a node gives its light: half the diagonal between nodes of the coarsest pass, and a little."""
+"""Reach of a lit node, in nodes: half the diagonal between nodes of the coarsest pass, and a little more."""
 _STRIPE = 2
-"""Nodes across a stripe of what is not lit."""
+"""Nodes across a stripe, which marks what is not lit."""
 
 
 def place_of(folder: str | os.PathLike[str]) -> Path | None:
-    """Where the partial run is that a folder is, or has beside it in place of a finished one; None if there is none."""
+    """The partial run that a folder is, or that lies beside a folder that does not exist; None if there is none."""
     own = Path(folder)
     if partial.is_partial(own):
         return own
@@ -45,7 +45,7 @@ def place_of(folder: str | os.PathLike[str]) -> Path | None:
 
 
 def load(place: Path) -> tuple[Illumination, float]:
-    """Read the light of a partial run, and how much of all light it is.
+    """Read the light of a partial run, and the share of all light that it has.
 
     Raises
     ------
@@ -77,7 +77,7 @@ def load(place: Path) -> tuple[Illumination, float]:
         samples, share = _samples(targets, order, kept.ranges)
         whole = Answer(samples.light, samples.spread, samples.paths, samples.channels, 0.0)
         answers = [answer for answer in split(whole, targets) if answer is not None]
-        del answers[len(nodes) : len(nodes) + len(held)]  # the middle of the sweep will do until the run has ended
+        del answers[len(nodes) : len(nodes) + len(held)]  # the middle of the sweep is used until the run has ended
         grids = []
         for number, (field, spec) in enumerate(zip(scene.fields, specs)):
             known = of_field(scene, answers, number)
@@ -93,7 +93,7 @@ def load(place: Path) -> tuple[Illumination, float]:
 
 
 def _samples(targets: Sequence[Queries], order: NDArray[np.int64], ranges: Mapping[str, Any]) -> tuple[Samples, float]:
-    """Moments in the order of the targets, with paths -1 where nothing is known; and the share that is known."""
+    """Samples in the order of the targets, with paths -1 for those without light; and the lit share."""
     queries, parts = join_queries(targets), []
     for arrays in ranges.values():
         light, spread, paths = (np.empty_like(arrays[key]) for key in ("light", "spread", "paths"))
@@ -110,7 +110,7 @@ def _samples(targets: Sequence[Queries], order: NDArray[np.int64], ranges: Mappi
 
 
 def _marked(grid: IlluminationGrid, known: Samples) -> IlluminationGrid:
-    """With stripes on the nodes that are far from every sample."""
+    """The grid with stripes on the nodes that are far from every sample."""
     from scipy.ndimage import distance_transform_edt
 
     index = np.round(world_to_index(grid.spec, known.queries.point)).astype(np.int64)
@@ -126,6 +126,6 @@ def _marked(grid: IlluminationGrid, known: Samples) -> IlluminationGrid:
 
 
 def _wall(rows: int, quad: Any, answer: Samples) -> WallTexture:
-    """Texture of a wall; what is not lit shows its nearest texel that is."""
+    """Texture of a wall; an unlit texel has the light of its nearest lit one."""
     paths = np.maximum(answer.paths, 0)
     return wall_texture(rows, quad, Samples(answer.queries, answer.light, answer.spread, paths, answer.channels))

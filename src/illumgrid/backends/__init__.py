@@ -1,1 +1,1 @@
-"""Light transport: one file a backend."""
+"""Light transport: one file per backend."""

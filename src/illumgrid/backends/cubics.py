@@ -1,4 +1,4 @@
-"""A trilinear field along a ray through one cell is a cubic; where it reaches a level for the first time."""
+"""A trilinear field along a ray through one cell is a cubic: where it first reaches a level."""
 
 import numpy as np
 
@@ -11,11 +11,11 @@ inlined = cached(_nrt=False, forceinline=True)
 @inlined
 def first_root(q0, q1, q2, q3, end):
     """Smallest t in [0, end] at which q0 + q1 t + q2 t² + q3 t³ reaches 0 from q0 < 0; inf if none."""
-    # On [0, 1]: the Bernstein coefficients bound the cubic, and most cells end here.
+    # On [0, 1] the Bernstein coefficients bound the cubic, and most cells end here.
     a, b, c = q1 * end, q2 * end * end, q3 * end * end * end
     if 3.0 * q0 + a < 0.0 and 3.0 * q0 + 2.0 * a + b < 0.0 and q0 + a + b + c < 0.0:
         return np.inf
-    # The roots of the derivative part [0, 1] into monotone pieces.
+    # The roots of the derivative divide [0, 1] into monotone pieces.
     low, high = 2.0, 2.0
     half = b * b - 3.0 * a * c
     if half > 0.0:
@@ -58,7 +58,7 @@ def next_root(q1, q2, q3, end):
     """
     a, b, c = q1 * end, q2 * end * end, q3 * end * end * end
     if a == 0.0:
-        if b > 0.0 or (b == 0.0 and c >= 0.0):  # all zero: the cell is flat, at the level, hence solid
+        if b > 0.0 or (b == 0.0 and c >= 0.0):  # all zero: the cell is constant, at the level, hence solid
             return 0.0
         return -b / c * end if c > 0.0 and -b <= c else np.inf
     if a > 0.0:

@@ -1,7 +1,7 @@
 """Light transport over Intel's Embree (the optional package embreex): the NumPy path loop, all rays of a step at once.
 
-Embree sees the meshes that `numba` sees with ``surface="mesh"``, in the same single precision, so that both walk the
-same paths but where a ray grazes an edge.
+Embree gets the same meshes as `numba` with ``surface="mesh"``, in the same single precision, so that both trace the
+same paths except where a ray grazes an edge.
 """
 
 import importlib.util
@@ -60,7 +60,7 @@ class Casting:
     def meet(
         self, f: int, level: Floats, x: Floats, normal: Floats, d: Floats, own: Bools, face: Ints
     ) -> tuple[Floats, Ints, Ints]:
-        """A ray that goes under its own face has met it at once; else it starts off by what rounding may do."""
+        """A ray that dips under its own face meets it at once; otherwise it is offset by the bound on rounding."""
         t, what, at = np.full(len(x), np.inf), np.full(len(x), MISS), np.full(len(x), NOWHERE)
         ray = np.flatnonzero(own)
         facing = normal.copy()
@@ -69,26 +69,26 @@ class Casting:
         under = ray[dips]
         t[under], what[under], at[under] = 0.0, SURFACE, face[under]
         stays = np.zeros(len(x), bool)
-        stays[ray] = dips | self.scene.cap[face[ray]]  # from a cap the convex box cannot be met again
+        stays[ray] = dips | self.scene.cap[face[ray]]  # a ray from a cap cannot meet the convex box again
 
         ray = np.flatnonzero(~stays)
         far, met, front = self.first(f, (x + self.scene.off[f] * facing)[ray], d[ray])
         hit, back = ray[front], ray[(met != NOWHERE) & ~front]
         t[hit], at[hit] = far[front], met[front]
         what[hit] = np.where(self.scene.cap[met[front]], CAP, SURFACE)
-        # One that meets a back went under a neighbour of its face, or was inside all the time.
+        # A ray that meets a back face dipped under a neighbour of its face, or was inside from the start.
         t[back], what[back], at[back] = 0.0, np.where(own[back], SURFACE, BURIED), face[back]
         return t, what, at
 
     def normal(self, f: int, what: Ints, face: Ints, x: Floats, d: Floats) -> Floats:
-        """The gradient normal; that of the face on a cap, or if there is none."""
+        """The gradient normal; that of the face on a cap, or if the gradient vanishes."""
         smooth = gradient_normal(self.scene, f, x)
         geometric = np.flatnonzero((what == CAP) | ~smooth.any(axis=1))
         smooth[geometric] = self.scene.facing[face[geometric]]
         return smooth
 
     def begin(self, own: Ints, x: Floats, normal: Floats) -> tuple[Floats, Ints]:
-        """Along the normal onto the mesh, or along that of the cell: see `mesh.cast.settle`."""
+        """Move along the normal onto the mesh, or along that of the cell: see `mesh.cast.settle`."""
         x, face = x.copy(), np.full(len(x), NOWHERE)
         for f in range(len(self.scene.twin)):
             mine = np.flatnonzero(own == f)
@@ -99,7 +99,7 @@ class Casting:
         return x, face
 
     def settle(self, f: int, x: Floats, normal: Floats) -> tuple[Floats, Ints]:
-        """Onto a front against the normal, or a back along it, within a cell, no cap: see `mesh.cast.settle_along`."""
+        """Move onto a front face against the normal or a back along it, within a cell: see `mesh.cast.settle_along`."""
         reach = 1.0 / (np.abs(normal) / self.scene.spacing[f]).max(axis=1, initial=0.0)
         found, shift, face = np.full(len(x), np.inf), np.zeros(len(x)), np.full(len(x), LOST)
         near = 2.0 * self.scene.off[f]
@@ -112,7 +112,7 @@ class Casting:
         return x + shift[:, None] * normal, face
 
     def inside(self, f: int, level: Floats, x: Floats, normal: Floats) -> Bools:
-        """Whether a ray from beside the point along the normal sees a back."""
+        """Whether a ray from beside the point along the normal meets a back face."""
         _, met, front = self.first(f, x + self.scene.off[f] * normal, normal)
         return np.asarray((met != NOWHERE) & ~front)
 
@@ -132,24 +132,24 @@ def near_enough(x: Floats, d: Floats) -> Floats:
 
 
 def grow(vertices: Floats, faces: Ints) -> Any:
-    """Embree's scene of a mesh, in the space of `LevelMesh`; None without faces, which Embree does not take."""
+    """Embree's scene of a mesh, in the space of `LevelMesh`; None without faces, which Embree does not accept."""
     from embreex.mesh_construction import TriangleMesh
     from embreex.rtcore_scene import EmbreeScene
 
     if not len(faces):
         return None
     centre, scale = unit_cube(vertices[faces])
-    scene = EmbreeScene(robust=True)  # no ray gets between two faces
+    scene = EmbreeScene(robust=True)  # no ray passes between two faces
     TriangleMesh(scene, ((vertices - centre) * scale).astype(np.float32), faces.astype(np.int32))
     scene.run(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32))  # builds the tree
     return scene
 
 
 def by_embree(scene: Any, meshes: Sequence[LevelMesh], stop: NDArray[np.uint8]) -> Cast:
-    """How embreex casts rays, until `stop` (1,) is set."""
+    """The function by which embreex casts rays, until `stop` (1,) is set."""
 
     def cast(f: int, x: Floats, d: Floats) -> tuple[Floats, Ints]:
-        if stop[0]:  # the caller's thread has seen Ctrl-C
+        if stop[0]:  # the caller's thread has received Ctrl-C
             raise KeyboardInterrupt
         tree = meshes[f].tree
         if tree is None or not len(x):
@@ -169,12 +169,12 @@ def by_embree(scene: Any, meshes: Sequence[LevelMesh], stop: NDArray[np.uint8]) 
 
 @dataclass(frozen=True)
 class Embree:
-    """Paths over the meshes of the level sets, cast by Intel's Embree.
+    """Paths over the meshes of the level sets, traced by Intel's Embree.
 
     Parameters
     ----------
     threads : int
-        Threads that share the queries; 0 takes one for each processor. The answer does not depend on it.
+        Threads that share the queries; 0 means one per processor. The result does not depend on it.
     """
 
     name: ClassVar[str] = "embree"
@@ -189,11 +189,11 @@ class Embree:
 
     @classmethod
     def available(cls) -> str | None:
-        """None, or what would make it so."""
+        """None, or the remedy."""
         return None if importlib.util.find_spec("embreex") else "pip install embreex"
 
     def prepare(self, scene: Scene) -> "EmbreeTracer":
-        """Lay the fields out; meshes are built when they are asked for."""
+        """Lay the fields out; meshes are built on first use."""
         check_opaque(scene)
         return EmbreeTracer(self, scene, *laid_out(scene), Meshes(scene, grow), pool(self.threads))
 
@@ -238,7 +238,7 @@ class EmbreeTracer:
         return Samples(queries, mean, m2, count, self.channels)
 
     def _pieces(self, level: Floats, stop: NDArray[np.uint8]) -> Iterator[tuple[Casting, NDArray[np.int64]]]:
-        """What the rays meet, and queries for which it does."""
+        """The surfaces for each row of levels, and the queries on it."""
         for row, members in row_groups(self.scene, level):
             meshes = self.meshes.of(row)
             layout = meshed(self.fields, meshes)
@@ -249,5 +249,5 @@ class EmbreeTracer:
 
 @hookimpl
 def register_backends() -> list[type[Backend]]:
-    """Name this file's stage to the registry, as a plugin does."""
+    """Register the stage of this file, as a plugin does."""
     return [Embree]

@@ -1,6 +1,6 @@
 """Paths that end in a cache, compiled: the light that grids and walls hold where a ray meets a surface.
 
-`illumgrid.grid.cache.Cache` says what the tables are.
+`illumgrid.grid.cache.Cache` describes the tables.
 """
 
 import numpy as np
@@ -16,7 +16,7 @@ jit = cached(march, simd, constants, _nrt=False)
 
 @jit
 def place_in_sweep(cache, level):
-    """Where in the sweep, 0 to 1, a row of levels is; `OFF_SWEEP` if it is none of its rows, or there is no cache."""
+    """Position in the sweep, 0 to 1, of a row of levels; `OFF_SWEEP` if it is not on the sweep, or without a cache."""
     if cache.start.shape[0] == 0:
         return OFF_SWEEP
     place = 0.0
@@ -32,7 +32,7 @@ def place_in_sweep(cache, level):
 
 @jit
 def gather_cached(cache, lattice, p, q, r, throughput, worth):
-    """Add to what a path is worth the light that it ends in at index (p, q, r) of a lattice: whether it may end."""
+    """Add the cached light at index (p, q, r) of a lattice to a path's contribution; whether it may end there."""
     nx, ny, nz = cache.shape[lattice, 0], cache.shape[lattice, 1], cache.shape[lattice, 2]
     p, q, r = min(max(p, 0.0), nx - 1.0), min(max(q, 0.0), ny - 1.0), min(max(r, 0.0), nz - 1.0)
     a, b, c = int(p), int(q), int(r)
@@ -52,7 +52,7 @@ def gather_cached(cache, lattice, p, q, r, throughput, worth):
 
 @jit
 def ends_in_cache(scene, cache, place, number, what, t, x, d, throughput, worth):
-    """Whether a path that met a surface at x after the distance t along d ends there: then its light is gathered.
+    """Whether a path that met a surface at x after the distance t along d ends there; then adds its cached light.
 
     `place` is that of its levels in the sweep. It goes on from caps, from the backs of walls, and after rays shorter
     than the lattice's spacing: nodes would light their own neighbours.

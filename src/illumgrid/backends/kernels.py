@@ -1,8 +1,8 @@
 """The path loop, compiled: rays among quads and level sets, lamps, and the moments of what the paths bring.
 
-Numba's disk cache does not see edits in other files: `simd.cached` names all whose functions end up in this code; what
-else is imported is frozen. Kernels are serial, release the GIL and depend on nothing but their arguments; threads are
-the caller's business. What stands for a level set is asked through `surfaces`.
+Numba's disk cache does not notice edits in other files: `simd.cached` lists all files whose functions end up in this
+code; anything else that is imported is frozen. Kernels are serial, release the GIL and depend only on their arguments;
+the caller starts threads. The surface that represents a level set is reached through `surfaces`.
 """
 
 import numpy as np
@@ -45,8 +45,8 @@ NOT_SQUARE = 0x2AAAAA80
 def meet_quad(scene, q, x, d):
     """Distance t at which the frame ray x + t d meets quad q; inf if it does not.
 
-    What lies on the quad but for a rounding error, as at an edge that two walls share or on a floor, is in front of it:
-    a ray that leaves for the back meets it at once, one that leaves for the front does not.
+    A point on the quad up to a rounding error, as at an edge that two walls share or on a floor, counts as in front of
+    it: a ray that leaves towards the back meets it at once, one that leaves towards the front does not.
     """
     normal = scene.quad_normal[q]
     approach = dot(normal, d)
@@ -69,7 +69,7 @@ def meet_quad(scene, q, x, d):
 def leave_shell(scene, f, level, x, n, d, own, face, limit):
     """First meeting of the frame ray x + t d, which starts within the shell of field f, with its inner side.
 
-    As `meet_solid`; at the border of the volume the shell is closed by caps.
+    Like `meet_solid`; at the border of the volume the shell is closed by caps.
     """
     t, what, _ = meet_solid(scene, scene.twin[f], -level, x, n, d, own and face < 0, np.int64(NOWHERE), limit)
     if what != MISS:
@@ -117,7 +117,7 @@ def hit_beyond(scene, level, x, n, d, on, on_face, within):
 
 @jit
 def lets_through(scene, number, what):
-    """Share of the light that goes straight through what a ray met."""
+    """Share of the light that passes straight through the surface that a ray met."""
     if number < 0 or number >= scene.transmission.shape[0] or (what != SURFACE and what != CAP):
         return 0.0
     return scene.transmission[number]
@@ -125,7 +125,7 @@ def lets_through(scene, number, what):
 
 @jit
 def followed(scene, key, path, segment, level, x, n, d, on, on_face, within):
-    """As `nearest_hit`, after the films that the path goes through by chance: (t, number, what, face, within)."""
+    """Like `nearest_hit`, beyond the films that the path passes by chance: (t, number, what, face, within)."""
     t, number, what, face = hit_beyond(scene, level, x, n, d, on, on_face, within)
     for film in range(MOST_FILMS):
         share = lets_through(scene, number, what)
@@ -165,7 +165,7 @@ def shells_around(scene, level, x, n, own):
 
 @jit
 def light_asked(scene, choice, u, v, level, on, on_face, x, n, within):
-    """Ask one light for what arrives at x: (weight, quad, direction); the quad is -1 for distant light.
+    """Sample one light at x: (weight, quad, direction); the quad is -1 for distant light.
 
     The weight, of a lamp's emission or of the radiance from that direction, is that of the balance heuristic: cosine
     density over the sum of both densities (Veach & Guibas 1995).
@@ -185,7 +185,7 @@ def light_asked(scene, choice, u, v, level, on, on_face, x, n, within):
     by_cosine = dot(n, d) / np.pi
     if by_cosine <= 0.0 or by_light <= 0.0 or (q >= 0 and number == on):
         return 0.0, q, d
-    # The ray that meets this lamp first, or nothing, has met nothing else before but films, which let a share through.
+    # The ray may meet only this lamp, or nothing, and films before it, which let a share through.
     weight, start = by_cosine / (by_cosine + by_light), x
     t, met, what, face = nearest_hit(scene, level, x, n, d, on, on_face, within)
     for _ in range(MOST_FILMS):
@@ -203,14 +203,14 @@ def light_asked(scene, choice, u, v, level, on, on_face, x, n, within):
 def walk(scene, cache, place, key, path, bounces, level, own, own_face, x, n, within, throughput, worth):
     """One path from the frame point x, with normal n, on `own_face` of surface `own`: fills its `worth` (C,).
 
-    The irradiance there is π times the mean over the paths. `throughput` (C,) is room for the share of the light that
-    comes back along the path. `place` is that of its levels in the sweep of the cache; `within` has the bits of the
-    fields whose shells it starts in.
+    The irradiance there is π times the mean over the paths. `throughput` (C,) is scratch memory for the product of the
+    albedos along the path. `place` is the position of its levels in the sweep of the cache; `within` has the bits of
+    the fields whose shells it starts in.
     """
     throughput[:], worth[:] = 1.0, 0.0
     on, on_face, fields = own, own_face, scene.twin.shape[0]
     for segment in range(bounces + 1):
-        # Ask a lamp or the sky for light, weighted against the chance that the ray below finds it. One pair of numbers
+        # Sample a lamp or the sky, weighted against the chance that the ray below finds it. One pair of numbers
         # serves both: each keeps its mean, and their shared boxes keep the error bars short.
         u1, u2 = draw_pair(key, path, np.uint64(segment))
         if scene.lamps.shape[0] > 0 or scene.asked[0] < 1.0:
@@ -221,16 +221,16 @@ def walk(scene, cache, place, key, path, bounces, level, own, own_face, x, n, wi
             elif weight > 0.0:
                 gather_asked(scene, worth, throughput, weight, d)
 
-        # Choose a direction by the cosine about the normal.
+        # Choose a direction, cosine-distributed about the normal.
         d = cosine_direction(u1, u2, n[0], n[1], n[2])
 
-        # Follow the ray to the nearest surface, by chance through films; one that dips under its own hit it already.
+        # Follow the ray to the nearest surface, through films by chance; one that dips under its own meets it at once.
         if scene.transmission.shape[0] == 0:
             t, number, what, face = nearest_hit(scene, level, x, n, d, on, on_face, within)
         else:
             t, number, what, face, within = followed(scene, key, path, segment, level, x, n, d, on, on_face, within)
 
-        # A path that escapes sees the sky, and ends.
+        # A path that escapes sees the sky and ends.
         if what == MISS:
             gather(worth, throughput, 1.0, scene.background)
             if scene.harmonics.shape[0] > 0:
@@ -252,13 +252,13 @@ def walk(scene, cache, place, key, path, bounces, level, own, own_face, x, n, wi
             weight = by_cosine / (by_cosine + by_lamp) if front else 0.0
         gather(worth, throughput, weight, scene.emission[number])
 
-        # Reflect: the albedo takes its share, and the path goes on from the hit.
+        # Reflect: multiply by the albedo, and continue from the hit.
         for channel in range(worth.shape[0]):
             throughput[channel] *= scene.albedo[number, channel]
         on, on_face = number, face
         if t > 0.0 or what == QUAD:
             x = (x[0] + t * d[0], x[1] + t * d[1], x[2] + t * d[2])
-            # End where the light is known: on the outer side.
+            # End where the cache is trusted: on the outer side.
             inner = number < fields and (within >> number) & 1 == 1
             if (
                 cache.after <= segment < bounces
@@ -275,7 +275,7 @@ def walk(scene, cache, place, key, path, bounces, level, own, own_face, x, n, wi
 
 @jit
 def mixed_differences(worth, at, size, channel, many):
-    """Variance of a path as four paths in one box tell it, that share a half of it by twos: in both ways.
+    """Variance of a path from the mixed differences of four paths in one box, of which two share either half.
 
     (one - two - three + four)² / 4, over all paths of the net from row `at` on and `many` of the squarest shapes of
     box. What changes along one number alone cancels, as it does in the mean over the net.
@@ -297,9 +297,9 @@ def mixed_differences(worth, at, size, channel, many):
 
 @jit
 def net_variance(worth, at, size, channel):
-    """Variance that a path of the net from row `at` on would have if independent paths were as far off as this net is.
+    """Variance of a path with which independent paths would have the error of the net from row `at` on.
 
-    How the differences shrank from nets of a quarter of the size is taken to go on: by half at edges of light, at most.
+    Extrapolates how the differences shrank from nets of a quarter of the size: by half at most, as at edges of light.
     """
     if size == 2:
         return 0.5 * (worth[at, channel] - worth[at + 1, channel]) ** 2
@@ -316,9 +316,9 @@ def net_variance(worth, at, size, channel):
 def moments(worth, first, sky, lamplight, channel):
     """Mean worth of paths number `first` on, and its m2, so that stderr² = m2 / (count (count - 1)).
 
-    The range is cut into nets. What no path met is added: features too small to be found change the light by UNSEEN of
-    what one path brings in the mean, or from the sky; one more path may be as bright as the brightest that was met, or
-    as all lamps spread evenly.
+    The range is cut into nets. An allowance for light that no path met is added: features too small to be found change
+    the light by UNSEEN of the mean contribution of a path, or of the sky; and one more path may be as bright as the
+    brightest so far, or as all lamps spread evenly.
     """
     count = worth.shape[0]
     total, known, mean, brightest, at = 0.0, 0, 0.0, 0.0, np.int64(0)
@@ -342,17 +342,17 @@ def moments(worth, first, sky, lamplight, channel):
 def solve_queries(
     scene, cache, ids, point, normal, level, target, first, bounces, seed, throughput, worth, mean, m2, paths, stop
 ):  # fmt: skip
-    """Irradiance at queries in frame coordinates, from a path for each row of `worth`, from number `first` on.
+    """Irradiance at queries in frame coordinates, from one path per row of `worth`, beginning with number `first`.
 
-    Fills mean (n, C), m2 (n, C) and paths (n,); `throughput` (C,) and `worth` (paths, C) are room to write into.
-    Another thread may set `stop` (1,): no further path begins, and the answer is worth nothing.
+    Fills mean (n, C), m2 (n, C) and paths (n,); `throughput` (C,) and `worth` (paths, C) are scratch memory.
+    Another thread may set `stop` (1,): no further path begins, and the result is invalid.
     """
     count = worth.shape[0]
     for i in range(ids.shape[0]):
         x, n = (point[i, 0], point[i, 1], point[i, 2]), (normal[i, 0], normal[i, 1], normal[i, 2])
         if n[0] == 0.0 and n[1] == 0.0 and n[2] == 0.0:
             continue
-        own = np.int64(target[i])  # one type of number throughout: each further one is compiled anew
+        own = np.int64(target[i])  # one type of number throughout: each additional type is compiled separately
         x, face = begin(scene, own, x, n)
         within = shells_around(scene, level[i], x, n, own)
         if face == LOST or within < 0:
@@ -373,7 +373,7 @@ def solve_queries(
 def cast_rays(scene, level, origin, direction, on, t, number, what, normal):
     """First hits of frame rays (n, 3), all under one row of levels; fills t, number, what and normal.
 
-    Rays from nowhere (`on` is -1) are those of a camera: they see the fronts of quads only.
+    Rays that start on no surface (`on` is -1) are those of a camera: they see the fronts of quads only.
     """
     fields, none, nowhere, outside = scene.twin.shape[0], (0.0, 0.0, 0.0), np.int64(NOWHERE), np.int64(0)
     for i in range(origin.shape[0]):
@@ -381,7 +381,7 @@ def cast_rays(scene, level, origin, direction, on, t, number, what, normal):
         through, start, passed = on, x, 0.0
         t[i], number[i], what[i], face = nearest_hit(scene, level, x, none, d, on, nowhere, outside)
         while on < 0 and what[i] == QUAD and dot(scene.quad_normal[number[i] - fields], d) >= 0.0:
-            # A wall seen from behind is not there: go on from it.
+            # Walls are not drawn from behind: continue from there.
             passed += t[i]
             through = number[i]
             start = (x[0] + passed * d[0], x[1] + passed * d[1], x[2] + passed * d[2])

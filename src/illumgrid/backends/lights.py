@@ -1,6 +1,6 @@
-"""What the path loop knows of lights: directions in which to ask them, densities, and what they send, compiled.
+"""Lights for the path loop, compiled: directions in which to sample them, densities, and their radiance.
 
-`illumgrid.field.levelset.Marchable` says what the tables are.
+`illumgrid.field.levelset.Marchable` describes the tables.
 """
 
 import numpy as np
@@ -19,7 +19,7 @@ def about(x, y, z, nx, ny, nz):
 
     The frame by Duff et al., "Building an orthonormal basis, revisited", JCGT 6(1), 2017.
     """
-    sign = 1.0 if nz >= -1e-6 else -1.0  # 0 is common on voxel data and comes out as -1e-17 in a turned frame
+    sign = 1.0 if nz >= -1e-6 else -1.0  # 0 is common on voxel data and becomes -1e-17 in a rotated frame
     a = -1.0 / (sign + nz)
     b = nx * ny * a
     return (
@@ -56,21 +56,21 @@ def lamp_point(scene, choice, u, v):
 
 @jit
 def lamp_density(scene, q, distance, d):
-    """Density per solid angle with which `lamp_point` finds a point of quad q's front at this distance along d."""
+    """Density per solid angle with which `lamp_point` samples a point of quad q's front at this distance along d."""
     facing = -dot(scene.quad_normal[q], d)
     return scene.lamp_density[q] * distance * distance / facing if facing > 0.0 else 0.0
 
 
 @inlined
 def gather(worth, throughput, weight, light):
-    """Add to what a path is worth the share of some light (C,) that comes back along it."""
+    """Add a share of some light (C,) to the contribution of a path."""
     for channel in range(worth.shape[0]):
         worth[channel] += throughput[channel] * weight * light[channel]
 
 
 @jit
 def distant_direction(scene, choice, u, v):
-    """Direction in which to ask for distant light: a pixel of the image by its brightness, or a disc evenly."""
+    """Direction that samples distant light: a pixel of the image by its brightness, or a disc uniformly."""
     if choice < scene.asked[1]:
         rows, columns = scene.image_density.shape
         i = np.searchsorted(scene.image_rows, u, side="right")
@@ -106,7 +106,7 @@ def image_place(scene, d):
 
 @jit
 def distant_density(scene, d):
-    """Density per solid angle with which `distant_direction` finds the frame direction d."""
+    """Density per solid angle with which `distant_direction` samples the frame direction d."""
     density = 0.0
     if scene.image_density.shape[0] > 0:
         v, u = image_place(scene, d)
@@ -120,7 +120,7 @@ def distant_density(scene, d):
 
 @jit
 def gather_asked(scene, worth, throughput, weight, d):
-    """Add to what a path is worth the share of the image and the discs that comes along the frame direction d."""
+    """Add the light of image and discs along the frame direction d to the contribution of a path."""
     for disc in range(scene.disc_cosine.shape[0]):
         if dot(scene.disc_axis[disc], d) >= scene.disc_cosine[disc]:
             gather(worth, throughput, weight, scene.disc_radiance[disc])

@@ -33,7 +33,7 @@ def about(x: Floats, y: Floats, z: Floats, normal: Floats) -> Floats:
 
 
 def lamp_density(scene: Marchable, q: Ints, distance: Floats, d: Floats) -> Floats:
-    """Density per solid angle (n,) with which lamps are asked at the points of quads q, at these distances along d."""
+    """Density per solid angle (n,) with which lamps are sampled at points of quads q, at these distances along d."""
     facing = -np.einsum("ij,ij->i", scene.quad_normal[q], d)
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(facing > 0, scene.lamp_density[q] * distance * distance / facing, 0.0)
@@ -47,7 +47,7 @@ def image_place(scene: Marchable, d: Floats) -> tuple[Floats, Floats]:
 
 
 def distant_direction(scene: Marchable, u: Floats) -> Floats:
-    """Directions (n, 3) in which to ask for distant light, from the numbers u (n, 3)."""
+    """Directions (n, 3) that sample distant light, from the numbers u (n, 3)."""
     disc = np.minimum(np.searchsorted(scene.asked[2:], u[:, 2], side="right"), len(scene.disc_cosine) - 1)
     result = np.zeros((len(u), 3))
     pictured = u[:, 2] < scene.asked[1]
@@ -73,7 +73,7 @@ def distant_direction(scene: Marchable, u: Floats) -> Floats:
 
 
 def distant_density(scene: Marchable, d: Floats) -> Floats:
-    """Density per solid angle (n,) with which `distant_direction` finds directions (n, 3)."""
+    """Density per solid angle (n,) with which `distant_direction` samples directions (n, 3)."""
     density = ((d @ scene.disc_axis.T >= scene.disc_cosine) * scene.disc_density).sum(axis=1)
     if len(scene.image):
         v, u = image_place(scene, d)
@@ -101,9 +101,9 @@ def asked_radiance(scene: Marchable, d: Floats) -> Floats:
 
 
 def sky_seen(scene: Marchable, normal: Floats, d: Floats) -> Iterator[tuple[Floats, Floats]]:
-    """What rays that escape along d see: pairs of a weight (n, 1) and radiance (n, C).
+    """Light of the sky for rays that escape along d: pairs of a weight (n, 1) and radiance (n, C).
 
-    Distant light that is also asked for has the weight of the balance heuristic, all else 1.
+    Distant light that is also sampled directly has the weight of the balance heuristic, all other light 1.
     """
     every = np.ones((len(d), 1))
     yield every, np.tile(scene.background, (len(d), 1))

@@ -1,8 +1,8 @@
 """Rays that march through trilinear fields: the level set itself.
 
 The solid of a field is {sign v >= level}: see `Marchable`. Index coordinates of field f are (x - origin[f]) /
-spacing[f] for x in the frame of the scene; t is world distance throughout. Values are of the type that the file has:
-arithmetic makes each a double.
+spacing[f] for x in the frame of the scene; t is world distance throughout. Values have the type of the file;
+arithmetic converts each to double.
 """
 
 import numpy as np
@@ -16,10 +16,10 @@ from illumgrid.constants import BRICK_SHIFT, BURIED, CAP, MISS, NOWHERE, ON_A_VO
 from illumgrid.field.levelset import Marchable
 
 # No fastmath: a miss is t = inf, and the sign of a coefficient near zero decides the side.
-# Nor Numba's reference counts: nothing is allocated here, the caller keeps the arrays alive, and the atomic counts of a
-# scene handed from function to function cost a third of the time.
+# No reference counts either: nothing is allocated here, the caller keeps the arrays alive, and the atomic counts of a
+# scene passed from function to function cost a third of the time.
 jit = cached(cubics, simd, constants, _nrt=False)
-# A call that hands a scene on moves 200 words: what every ray calls is inlined.
+# A call that passes a scene moves 200 words: what every ray calls is inlined.
 inlined = cached(cubics, simd, constants, _nrt=False, forceinline=True)
 
 ONE = np.uint64(1)
@@ -46,8 +46,8 @@ def dot(a, b):
 
 @inlined
 def first_cell(u, d, last):
-    """Cell along one axis that a ray enters at index coordinate u; outside 0 .. last - 1 it has left the field."""
-    cell = int(u)  # without branches: on a voxel the sign of d is a coin toss
+    """Cell along one axis that a ray enters at index coordinate u; beyond 0 .. last - 1 it has left the field."""
+    cell = int(u)  # without branches: on a voxel the sign of d is unpredictable
     return cell - int((u == cell) & ((d < 0.0) | ((d == 0.0) & (cell == last))))
 
 
@@ -79,7 +79,7 @@ def follow(u, t, d, low, high):
 
 @inlined
 def first_of(x, y, z):
-    """Whether x is the smallest of three, and whether y is. Without branches: no processor predicts a coin toss."""
+    """Whether x is the smallest of three, and whether y is. Without branches, since the outcome is unpredictable."""
     return x <= y and x <= z, y < x and y <= z
 
 
@@ -95,7 +95,7 @@ def enter(ux, uy, uz, ix, iy, iz, kx, ky, kz, last_x, last_y, last_z):
         return np.inf, -1
     if iz == 0.0 and not 0.0 <= uz <= last_z:
         return np.inf, -1
-    # It enters through the last of three planes.
+    # It enters through the last of the three planes.
     t, face = 0.0, -1
     if ix != 0.0 and min(kx, last_x * ix + kx) > t:
         t, face = min(kx, last_x * ix + kx), 0
@@ -118,7 +118,7 @@ def cell_at(u, t, d, low, high):
 
 @inlined
 def cells_to_ask(bricks, brick, rank, c, end, fine):
-    """Cells of a brick, as bits, that rank high enough and lie between the cells of a ray's two ends."""
+    """Cells of a brick, as bits, whose rank is high enough and that lie between the cells of a ray's two ends."""
     left = at_least(bricks, brick, rank)
     left &= BETWEEN[((min(c[0], end[0]) >> fine & 3) << 2) | (max(c[0], end[0]) >> fine & 3)]
     left &= BETWEEN[16 | ((min(c[1], end[1]) >> fine & 3) << 2) | (max(c[1], end[1]) >> fine & 3)]
@@ -128,7 +128,7 @@ def cells_to_ask(bricks, brick, rank, c, end, fine):
 
 @inlined
 def bit_of(c, fine):
-    """Number of the bit that stands for a cell in its brick: a cell of its own, or one for 2³ cells if `fine` is 1."""
+    """Number of the bit of a cell in its brick; if `fine` is 1, a bit belongs to 2³ cells."""
     return ((c[0] >> fine & 3) << 4) | ((c[1] >> fine & 3) << 2) | (c[2] >> fine & 3)
 
 
@@ -154,7 +154,7 @@ def planes_along(u, d):
 def enter_field(u, d, i, k, last, limit):
     """Where a ray enters the box of a field: (t, t where it leaves, axis of the face, position, cell).
 
-    The x of the cell is -1 if it passes by, or comes to the box beyond `limit`.
+    The x of the cell is -1 if the ray misses the box, or reaches it beyond `limit`.
     """
     outside = np.inf, np.inf, -1, u, (-1, -1, -1)
     t, face = enter(u[0], u[1], u[2], i[0], i[1], i[2], k[0], k[1], k[2], last[0], last[1], last[2])
@@ -186,7 +186,7 @@ def hit_in_brick(
 ):  # fmt: skip
     """Follow a ray from cell to cell of a brick (Amanatides & Woo 1987), from cell c at t on: (t, whether it hit).
 
-    The cubic is asked in the cells `left` only, given as bits, none of which lies beyond t_end.
+    The cubic is solved only in the cells `left`, given as bits, none of which lies beyond t_end.
     """
     at = bit_of(c, fine)
     while left != 0:
@@ -214,13 +214,13 @@ def hit_in_brick(
             c[2] + (0 if on_x or on_y else toward[2]),
         )
         at = bit_of(c, fine)
-        left &= ~bit | (ONE << np.uint64(at))  # a bit is done with where the ray leaves what it stands for
+        left &= ~bit | (ONE << np.uint64(at))  # clear the bit when the ray leaves its cells
     return t, False
 
 
 @inlined
 def leap(hop, b, shift, far, u, d, i, k, toward, t):
-    """Leap over the cube of empty bricks that reaches `hop` bricks beyond b: (t, the brick behind it)."""
+    """Skip the cube of empty bricks that extends `hop` bricks beyond b: (t, the brick behind it)."""
     end_x, end_y, end_z = b[0] + hop * toward[0], b[1] + hop * toward[1], b[2] + hop * toward[2]
     side = 1.0 * (hop << shift)
     tx = (far[0] + side * toward[0]) * i[0] + k[0]
@@ -242,9 +242,9 @@ def leap(hop, b, shift, far, u, d, i, k, toward, t):
 def march(scene, f, level, u, d, on_surface, limit):
     """First meeting of a ray with the solid of field f, in index coordinates u + t d: (t, what, axis of a cap).
 
-    Bytes are compared first: see `field.bricks`. The ray leaps over the largest cube of bricks ahead that ranks
-    below the level. A brick that does not is crossed at once too if no cell between the ray's two ends in it ranks high
-    enough; else the ray goes from cell to cell and asks the cubic in such cells only.
+    Bytes are compared first: see `field.bricks`. The ray skips the largest cube of bricks ahead whose rank is below the
+    level. Another brick is also crossed at once if no cell between the ray's two ends in it has a rank that is high
+    enough; otherwise the ray goes from cell to cell and solves the cubic in such cells only.
     `on_surface`: the ray starts on the level set itself, outside.
     """
     last = scene.shape[f, 0] - 1, scene.shape[f, 1] - 1, scene.shape[f, 2] - 1
@@ -253,7 +253,7 @@ def march(scene, f, level, u, d, on_surface, limit):
     if c[0] < 0:
         return np.inf, MISS, -1
 
-    # In the solid already: at a cap, or buried.
+    # In the solid already: at a cap, or inside.
     step_y, start, sign = scene.shape[f, 2], scene.start[f], scene.sign[f]
     step_x = step_y * scene.shape[f, 1]
     if not on_surface:
@@ -274,7 +274,7 @@ def march(scene, f, level, u, d, on_surface, limit):
     b, fine, side = (c[0] >> shift, c[1] >> shift, c[2] >> shift), shift - BRICK_SHIFT, 1 << shift
     brick, beyond = ((b[0] * many_y + b[1]) * many_z + b[2]) << 7, (scene.brick_shape[f, 0] * many_y * many_z) << 7
     started = False
-    while 0 <= brick < beyond:  # t_out ends the march before that, but for rounding; what follows reads raw memory
+    while 0 <= brick < beyond:  # t_out ends the march earlier, except for rounding; the code below reads raw memory
         empty, far = count_below(bricks, brick + octant, rank), far_sides(b, ahead, shift)
         if empty == 8:
             return np.inf, MISS, -1
@@ -313,7 +313,7 @@ def march(scene, f, level, u, d, on_surface, limit):
 def march_from(scene, f, level, x, n, d, own, face, limit):
     """First meeting of the frame ray x + t d with field f's trilinear solid, t < limit: (t, what, axis of a cap).
 
-    `own`: the ray starts on that solid, at a cap if `face` says so; then the convex box cannot be met again.
+    `own`: the ray starts on that solid; if `face` is a cap, it cannot meet the convex box again.
     """
     if own and face >= 0:
         return np.inf, MISS, NOWHERE

@@ -22,7 +22,7 @@ def voxels(scene: Marchable, f: int) -> NDArray[Any]:
 
 
 def index_of(scene: Marchable, f: int, x: Floats) -> Floats:
-    """Index coordinates (n, 3) of frame points, on a plane of voxels where they nearly are."""
+    """Index coordinates (n, 3) of frame points, moved onto a plane of voxels if they are within rounding of it."""
     u = (x - scene.origin[f]) / scene.spacing[f]
     nearest = np.round(u)
     return np.asarray(np.where(np.abs(u - nearest) < ON_A_VOXEL, nearest, u))
@@ -109,7 +109,7 @@ def march(
     cell -= (p == cell) & ((d < 0) | (still & (cell == last)))
     ray = np.flatnonzero((t <= far.min(axis=1)) & ((cell >= 0) & (cell < last)).all(axis=1))
 
-    # A ray that comes from outside and starts in the solid meets a cap, or is buried.
+    # A ray that starts in the solid meets a cap if it comes from outside; otherwise it starts inside.
     solid = ray[(evaluate(cubic(scene, f, level[ray], cell[ray], p[ray] - cell[ray], d[ray]), np.zeros(len(ray))) >= 0)]
     solid = solid[~on_surface[solid]]
     t_hit[solid], what[solid], face[solid] = t[solid], np.where(entered[solid], CAP, BURIED), entry_axis[solid]
@@ -164,7 +164,7 @@ class Marching:
     def meet(
         self, f: int, level: Floats, x: Floats, normal: Floats, d: Floats, own: Bools, face: Ints
     ) -> tuple[Floats, Ints, Ints]:
-        """From a cap the convex box cannot be met again: see `Surfaces`."""
+        """A ray from a cap cannot meet the convex box again: see `Surfaces`."""
         t, what, at = np.full(len(x), np.inf), np.full(len(x), MISS), np.full(len(x), NOWHERE)
         ray = np.flatnonzero(~(own & (face != NOWHERE)))
         start, step = index_of(self.scene, f, x[ray]), d[ray] / self.scene.spacing[f]
@@ -181,7 +181,7 @@ class Marching:
         return x, np.full(len(x), NOWHERE)
 
     def inside(self, f: int, level: Floats, x: Floats, normal: Floats) -> Bools:
-        """By the trilinear value, the border included."""
+        """By the trilinear value; the border counts as inside."""
         u, last = index_of(self.scene, f, x), self.scene.shape[f] - 1
         cell = np.clip(np.floor(u), 0, last - 1).astype(np.int64)
         q = cubic(self.scene, f, level, cell, u - cell, np.zeros_like(u))

@@ -28,7 +28,7 @@ def outward(gx, gy, gz):
 
 @inlined
 def cell_at(scene, f, ux, uy, uz):
-    """The cell of field f that holds index u, where in it u lies, 0 to 1, and steps of flat numbers along x and y."""
+    """The cell of field f that contains index u, the place in it, 0 to 1, and steps of flat numbers along x and y."""
     last_x, last_y, last_z = scene.shape[f, 0] - 1, scene.shape[f, 1] - 1, scene.shape[f, 2] - 1
     cx, cy = follow(ux, 0.0, 0.0, 0, last_x - 1), follow(uy, 0.0, 0.0, 0, last_y - 1)
     cz = follow(uz, 0.0, 0.0, 0, last_z - 1)
@@ -38,7 +38,7 @@ def cell_at(scene, f, ux, uy, uz):
 
 @jit
 def cell_normal(scene, f, ux, uy, uz):
-    """Outward normal at index u of the trilinear cell of field f that holds it."""
+    """Outward normal at index u of the trilinear cell of field f that contains it."""
     cx, cy, cz, wx, wy, wz, step_x, step_y = cell_at(scene, f, ux, uy, uz)
     here = scene.start[f] + cx * step_x + cy * step_y + cz
     _, gx, _, _ = cubic(scene.values, scene.sign[f], here, step_x, step_y, 0.0, wx, wy, wz, 1.0, 0.0, 0.0)
@@ -70,7 +70,7 @@ def gradient_normal(scene, f, ux, uy, uz):
     if gx == 0.0 and gy == 0.0 and gz == 0.0:
         return cell_normal(scene, f, ux, uy, uz)
     sign = scene.sign[f]
-    gx, gy, gz = sign * gx + 0.0, sign * gy + 0.0, sign * gz + 0.0  # no -0, whose sign would turn a frame of axes
+    gx, gy, gz = sign * gx + 0.0, sign * gy + 0.0, sign * gz + 0.0  # no -0: its sign would change a frame
     return outward(gx / scene.spacing[f, 0], gy / scene.spacing[f, 1], gz / scene.spacing[f, 2])
 
 

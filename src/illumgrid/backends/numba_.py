@@ -1,4 +1,4 @@
-"""Light transport by compiled kernels: they march the trilinear level set, or cast rays at its mesh."""
+"""Light transport by compiled kernels, which march the trilinear level set or trace rays against its mesh."""
 
 import os
 import threading
@@ -39,12 +39,12 @@ class Numba:
     Parameters
     ----------
     threads : int
-        Threads that share the queries; 0 takes one for each processor. The answer does not depend on it.
+        Threads that share the queries; 0 means one per processor. The result does not depend on it.
     surface : {"auto", "levelset", "mesh"}
-        What stands for a level set. "levelset" marches the trilinear field: nothing is built, every query may have a
-        level of its own. "mesh" casts rays at the marching-cubes mesh, which differs by O(spacing²): one is built for
-        each row of levels, at most `meshes.MOST_ROWS`. "auto" is "levelset": one request does not tell how many rays
-        its meshes will serve in all, and an answer must not depend on it.
+        Representation of a level set. "levelset" marches the trilinear field: nothing is built, and every query may
+        have its own level. "mesh" traces rays against the marching-cubes mesh, which differs by O(spacing²): one is
+        built for each row of levels, at most `meshes.MOST_ROWS`. "auto" is "levelset": a single call does not show how
+        many rays its meshes will serve in all, and results must not depend on it.
     """
 
     name: ClassVar[str] = "numba"
@@ -59,7 +59,7 @@ class Numba:
             raise BadInput(f"the surface is {self.surface!r}; expected 'auto', 'levelset' or 'mesh'")
 
     def prepare(self, scene: Scene) -> "NumbaTracer":
-        """Lay the fields out; meshes are built when they are asked for."""
+        """Lay the fields out; meshes are built on first use."""
         meshes = None
         if self.surface == "mesh":
             from illumgrid.backends.mesh import bvh
@@ -74,7 +74,7 @@ class Numba:
 
 @dataclass(frozen=True, eq=False)
 class NumbaTracer:
-    """A scene set up for `Numba`: any number of threads may ask it. A copy in another process is set up there."""
+    """A scene set up for `Numba`: any number of threads may use it. A copy in another process is set up there."""
 
     backend: Numba
     scene: Scene
@@ -115,7 +115,7 @@ class NumbaTracer:
                 )  # fmt: skip
             mean[rows], m2[rows], count[rows] = light, spread, good
 
-        # Progress shows, and threads end together, if a chunk is at most a million paths.
+        # Chunks of at most a million paths, so that progress is visible and threads end together.
         threads = self.backend.threads or cores()
         size = max(1, min(1024, max(16, n // (8 * threads) + 1), (1 << 20) // len(paths)))
         pieces: Iterator[tuple[Any, NDArray[np.int64]]] = (
@@ -131,7 +131,7 @@ class NumbaTracer:
         return answer
 
     def _surfaces(self, level: NDArray[np.float64]) -> Iterator[tuple[Any, NDArray[np.int64]]]:
-        """What the rays meet, and the queries for which it does."""
+        """The surfaces, and the queries on them."""
         if self.meshes is None:
             yield self.fields, np.arange(len(level))
             return
@@ -142,11 +142,11 @@ class NumbaTracer:
 
 
 LOOK = 0.2
-"""Seconds after which a wait looks for Ctrl-C: a signal that comes just before the system call does not end it."""
+"""Seconds after which a wait checks for Ctrl-C: a signal just before the system call would not interrupt it."""
 
 
 def beside(work: Callable[[], None]) -> None:
-    """Do work that cannot be stopped, such as compilation, in another thread; Ctrl-C ends only the wait for it."""
+    """Do work that cannot be interrupted, such as compilation, in another thread; Ctrl-C ends only the wait for it."""
     trouble: list[BaseException] = []
 
     def do() -> None:
@@ -155,7 +155,7 @@ def beside(work: Callable[[], None]) -> None:
         except BaseException as problem:
             trouble.append(problem)
 
-    thread = threading.Thread(target=do, daemon=True)  # at the end of the process it is not waited for
+    thread = threading.Thread(target=do, daemon=True)  # the process does not wait for it at its end
     thread.start()
     while thread.is_alive():
         thread.join(LOOK)
@@ -164,19 +164,19 @@ def beside(work: Callable[[], None]) -> None:
 
 
 def compiled(kernel: Any, surfaces: Any) -> bool:
-    """Whether a kernel is compiled for surfaces of this type; as plain Python it always is."""
+    """Whether a kernel is compiled for surfaces of this type; as plain Python, it always is."""
     known = getattr(kernel, "signatures", None)
     return known is None or any(signature[0] == numba.typeof(surfaces) for signature in known)
 
 
 def pool(threads: int) -> ThreadPoolExecutor:
-    """So many threads, 0 for one per processor. The caller's is not among them: it waits for Ctrl-C."""
+    """So many threads, 0 for one per processor. The calling thread is not among them: it waits for Ctrl-C."""
     return _pool(threads or cores(), os.getpid())
 
 
 @cache
 def _pool(threads: int, process: int) -> ThreadPoolExecutor:
-    """All tracers of a process share their threads; a forked process has none of its parent's."""
+    """The threads that all tracers of a process share; a forked process has none of its parent's."""
     return ThreadPoolExecutor(threads)
 
 
@@ -186,9 +186,9 @@ def share(
     pieces: Iterator[tuple[Any, NDArray[np.int64]]],
     stop: NDArray[np.uint8],
 ) -> None:
-    """Do the work on all pieces. They are made while others are at work, but not many before their turn.
+    """Do the work on all pieces. Pieces are made while others are computed, but not many ahead of their turn.
 
-    On Ctrl-C pieces that wait are dropped, and `stop` (1,) tells those at work to end.
+    On Ctrl-C waiting pieces are dropped, and `stop` (1,) makes the running ones end.
     """
     waiting: dict[Future[None], int] = {}
     report = answered.get()
@@ -215,5 +215,5 @@ def share(
 
 @hookimpl
 def register_backends() -> list[type[Backend]]:
-    """Name this file's stage to the registry, as a plugin does."""
+    """Register the stage of this file, as a plugin does."""
     return [Numba]

@@ -1,7 +1,7 @@
 """The same paths in pure NumPy, written to be read: all rays of a batch take each step together.
 
-The path loop has the headings of `kernels.walk`; everything that Numba's kernels do for speed is left out. What rays
-meet is handed in: the trilinear level set here, its mesh in `embree`.
+The path loop has the headings of `kernels.walk`; everything that Numba's kernels do for speed is left out. The surfaces
+are an argument: the trilinear level set here, its mesh in `embree`.
 """
 
 from dataclasses import dataclass
@@ -34,13 +34,13 @@ from illumgrid.stages import Backend, hookimpl
 from illumgrid.transport.samples import Queries, Samples, in_frame, in_turn
 from illumgrid.transport.tracer import laid_out, solve_once
 
-BATCH = 1 << 15  # rays that take a step together
+BATCH = 1 << 15  # rays that take each step together
 
 
 def light_asked(
     surfaces: Surfaces, u: Floats, level: Floats, on: Ints, on_face: Ints, x: Floats, normal: Floats, within: Ints
 ) -> tuple[Floats, Floats]:
-    """Ask one light each for what arrives at x: weight (n,), and emission or radiance (n, C) that it goes with.
+    """Sample one light at x: weight (n,), and the emission or radiance (n, C) to which it applies.
 
     A lamp is chosen in proportion to its power, the point uniform by area, from the numbers u (n, 3). The weight is
     that of the balance heuristic: cosine density over the sum of both densities (Veach & Guibas 1995).
@@ -64,7 +64,7 @@ def light_asked(
         by_light[some], light[some] = distant_density(scene, d[some]), asked_radiance(scene, d[some])
     by_cosine = np.einsum("ij,ij->i", normal, d) / np.pi
     ask = np.flatnonzero((by_cosine > 0) & (by_light > 0) & ((number != on) | (number < 0)))
-    # The ray that meets this lamp first, or nothing, has met nothing else before but films, which let a share through.
+    # The ray may meet only this lamp, or nothing, and films before it, which let a share through.
     through = np.ones(len(ask))
 
     def dimmed(film: int, ray: Ints, share: Floats) -> Bools:
@@ -79,11 +79,11 @@ def light_asked(
 
 
 def place_in_sweep(cache: Cache, level: Floats) -> Floats:
-    """Where in the sweep, 0 to 1, rows of levels (n, F) are; `OFF_SWEEP` where they are none of its rows."""
+    """Position in the sweep, 0 to 1, of rows of levels (n, F); `OFF_SWEEP` if they do not belong to one setting."""
     if not len(cache.start):
         return np.full(len(level), OFF_SWEEP)
     first, last = cache.sweep.T
-    with np.errstate(divide="ignore", invalid="ignore"):  # a level that is held has no place
+    with np.errstate(divide="ignore", invalid="ignore"):  # a held level has no position
         share = (level - first) / (last - first)
     on = (np.abs(share - share[:, :1]) <= SAME_ROW) & (share >= -SAME_ROW) & (share <= 1 + SAME_ROW)
     return np.where(on.all(axis=1), np.clip(share[:, 0], 0, 1), OFF_SWEEP)
@@ -92,7 +92,7 @@ def place_in_sweep(cache: Cache, level: Floats) -> Floats:
 def cached_light(
     scene: Marchable, cache: Cache, place: Floats, number: Ints, what: Ints, t: Floats, x: Floats, d: Floats
 ) -> tuple[Floats, Bools]:
-    """Cached irradiance (n, C) where rays met surfaces at x, and whether (n,) their paths end: `gathering`."""
+    """Cached irradiance (n, C) where rays met surfaces at x, and whether (n,) paths end there: see `gathering`."""
     light, ends = np.zeros((len(x), cache.light.shape[1])), np.zeros(len(x), bool)
     fields = len(scene.twin)
     for lattice, (start, shape) in enumerate(zip(cache.start, cache.shape)):
@@ -145,7 +145,7 @@ def walk(
     normal: Floats,
     within: Ints,
 ) -> Floats:
-    """Worth (n, C) of one path from each point of a surface: the irradiance is π times the mean.
+    """Contribution (n, C) of one path from each point of a surface: the irradiance is π times the mean.
 
     `keep` is the share of the light that comes back along the path; `within` (n,) has the bits of the fields in
     whose shells it starts.
@@ -156,7 +156,7 @@ def walk(
     x, normal, on, on_face = x.copy(), normal.copy(), own.astype(np.int64), own_face.copy()
     alive, fields = np.arange(len(x)), len(scene.twin)
     for segment in range(bounces + 1):
-        # Ask a lamp or the sky for light, weighted against the chance that the ray below finds it. One pair of numbers
+        # Sample a lamp or the sky, weighted against the chance that the ray below finds it. One pair of numbers
         # serves both: each keeps its mean, and their shared boxes keep the error bars short.
         u1, u2 = draw_pair(key[alive], path[alive], np.uint64(segment))
         if len(scene.lamps) or scene.asked[0] < 1:
@@ -165,10 +165,10 @@ def walk(
             weight, light = light_asked(surfaces, u, *at)
             worth[alive] += keep[alive] * weight[:, None] * light
 
-        # Choose a direction by the cosine about the normal.
+        # Choose a direction, cosine-distributed about the normal.
         d = cosine_direction(u1, u2, normal[alive])
 
-        # Follow the ray to the nearest surface, by chance through films; one that dips under its own hit it already.
+        # Follow the ray to the nearest surface, through films by chance; one that dips under its own meets it at once.
         start, shells = (level[alive], x[alive], normal[alive]), within[alive]
 
         def by_chance(film: int, ray: Ints, share: Floats, alive: Ints = alive, segment: int = segment) -> Bools:
@@ -178,7 +178,7 @@ def walk(
         t, number, what, face = followed(surfaces, *start, d, on[alive], on_face[alive], shells, by_chance)
         within[alive] = shells
 
-        # A path that escapes sees the sky, and ends.
+        # A path that escapes sees the sky and ends.
         escaped, away = alive[what == MISS], d[what == MISS]
         for weight, light in sky_seen(scene, normal[escaped], away):
             worth[escaped] += keep[escaped] * weight * light
@@ -193,7 +193,7 @@ def walk(
         weight = emission_weight(scene, normal[alive], t, number, wall, approach, d)
         worth[alive] += keep[alive] * weight[:, None] * scene.emission[number]
 
-        # Reflect: the albedo takes its share, and the path goes on from the hit.
+        # Reflect: multiply by the albedo, and continue from the hit.
         keep[alive] *= scene.albedo[number]
         on[alive], on_face[alive] = number, face
         moved = (t > 0) | wall
@@ -204,10 +204,10 @@ def walk(
             normal[alive[here]] = side[:, None] * surfaces.normal(f, what[here], face[here], x[alive[here]], d[here])
         normal[alive[wall]] = -np.sign(approach)[:, None] * scene.quad_normal[number[wall] - fields]
 
-        # End where the light is known.
+        # End where the cache is trusted.
         goes_on = normal[alive].any(axis=1)
         if cache.after <= segment < bounces and len(cache.start):
-            inner = ~wall & (within[alive] >> np.where(wall, 0, number) & 1 == 1)  # of a shell: not in the grid
+            inner = ~wall & (within[alive] >> np.where(wall, 0, number) & 1 == 1)  # within a shell: not in the grid
             met = np.where(moved & ~inner, what, MISS)
             light, ends = cached_light(scene, cache, place[alive], number, met, t, x[alive], d)
             worth[alive] += keep[alive] * light / np.pi
@@ -220,7 +220,7 @@ def answer(
     surfaces: Surfaces, cache: Cache, key: NDArray[np.uint64], level: Floats, target: Ints, x: Floats, normal: Floats,
     paths: range, bounces: int,
 ) -> tuple[Floats, Floats, Bools]:  # fmt: skip
-    """Mean (n, C) and m2 (n, C) of the irradiance at queries in the frame, and which are no holes (n,).
+    """Mean (n, C) and m2 (n, C) of the irradiance at queries in the frame, and which (n,) are not holes.
 
     A hole has no normal, no surface within reach, or lies inside the solid of a field that is not its own.
     """
@@ -251,7 +251,7 @@ def answer(
 
 @dataclass(frozen=True)
 class Reference:
-    """The same paths as `numba`, in pure NumPy: slow, and easy to check."""
+    """The same paths as `numba`, in pure NumPy: slow and easy to check."""
 
     name: ClassVar[str] = "reference"
     geometry: ClassVar[Literal["mesh", "levelset", "both"]] = "levelset"
@@ -287,5 +287,5 @@ class ReferenceTracer:
 
 @hookimpl
 def register_backends() -> list[type[Backend]]:
-    """Name this file's stage to the registry, as a plugin does."""
+    """Register the stage of this file, as a plugin does."""
     return [Reference]

@@ -1,6 +1,6 @@
-"""What an eye sees behind films and in glossy coats, compiled: rays that end in the light of grids and walls.
+"""Rays from the eye through films and into glossy coats, compiled; they end in the light of grids and walls.
 
-Light paths know nothing of coats. As `kernels`, these are serial, and depend on nothing but their arguments.
+Light paths do not include coats. Like `kernels`, these functions are serial and depend only on their arguments.
 """
 
 import numpy as np
@@ -31,10 +31,10 @@ _SOURCES = kernels, gathering, lights, cubics, march, normals, simd, surfaces, t
 jit = cached(*_SOURCES, _nrt=False)  # as in `march`
 
 AT_NORMAL = 0.04
-"""Share of the light that a coat reflects where it is met at a right angle: that of a refractive index of 1.5."""
+"""Share of the light that a coat reflects at normal incidence: that of a refractive index of 1.5."""
 
 STEEPEST = 1e-3
-"""Least cosine at which a coat is seen: smooth normals of what is seen edge-on may face away."""
+"""Least cosine at which a coat is seen: smooth normals of surfaces seen edge-on may face away."""
 
 
 @jit
@@ -48,7 +48,7 @@ def reflectance(cosine):
 
 @jit
 def half_vector(alpha, v, u1, u2):
-    """One of the normals of a rough coat that are seen from v; both in a frame whose third axis is its mean normal.
+    """A visible normal of a rough coat seen from v; both in a frame whose third axis is its mean normal.
 
     E. Heitz, "Sampling the GGX distribution of visible normals", JCGT 7(4), 2018.
     """
@@ -69,13 +69,13 @@ def half_vector(alpha, v, u1, u2):
 
 @jit
 def shadowing(alpha, cosine):
-    """Smith's Λ of GGX: 1 / (1 + Λ) of the coat's normals that face a direction are seen from it."""
+    """Smith's Λ of GGX: the share 1 / (1 + Λ) of the coat's normals that face a direction is visible from it."""
     return 0.5 * (np.sqrt(1.0 + alpha * alpha * (1.0 / (cosine * cosine) - 1.0)) - 1.0)
 
 
 @jit
 def lobe(alpha, v, n, d):
-    """Share of light from d that goes to v, times cosine, and the density of d as `direction` draws it.
+    """Share of light from d that is reflected to v, times cosine, and the density of d in `direction`.
 
     `alpha` is the roughness of a coat; below 0 the surface is matte, and sends all on.
     """
@@ -99,7 +99,7 @@ def lobe(alpha, v, n, d):
 
 @jit
 def direction(alpha, v, n, u1, u2):
-    """A direction from which light goes to v: mirrored at one of the coat's normals, or by the cosine."""
+    """A direction from which light is reflected to v: mirrored at a normal of the coat, or cosine-distributed."""
     if alpha < 0.0:
         return cosine_direction(u1, u2, n[0], n[1], n[2])
     along, across = about(1.0, 0.0, 0.0, n[0], n[1], n[2]), about(0.0, 1.0, 0.0, n[0], n[1], n[2])
@@ -111,7 +111,7 @@ def direction(alpha, v, n, u1, u2):
 
 @jit
 def looked_up(scene, cache, place, number, x, throughput, light):
-    """Add the share of the radiance that grid or wall `number` holds at the frame point x."""
+    """Add a share of the radiance that grid or wall `number` has at the frame point x."""
     fields = scene.twin.shape[0]
     if number < fields:
         origin, spacing = cache.origin[number], cache.spacing[number]
@@ -127,7 +127,7 @@ def looked_up(scene, cache, place, number, x, throughput, light):
 
 @jit
 def seen_along(scene, cache, place, cap, level, x, n, d, on, within, value, density, throughput, light):
-    """Add `value` times the radiance (3,) from d, through films, with light that is also asked for weighed by density.
+    """Add `value` times the radiance (3,) from d, through films; light that is also sampled gets its weight.
 
     `cap` is the radiance of caps of albedo 1.
     """
@@ -147,7 +147,7 @@ def seen_along(scene, cache, place, cap, level, x, n, d, on, within, value, dens
         passed += t
         start = (start[0] + t * d[0], start[1] + t * d[1], start[2] + t * d[2])
         if what == QUAD and dot(scene.quad_normal[number - fields], d) >= 0.0:
-            return  # its back is dark
+            return  # its back does not emit
         shared = 1.0
         if what == QUAD:
             shared = density / (density + lamp_density(scene, number - fields, passed, d))
@@ -169,7 +169,7 @@ def seen_along(scene, cache, place, cap, level, x, n, d, on, within, value, dens
 
 @jit
 def asked_for(scene, level, x, n, on, within, alpha, v, choice, u1, u2, throughput, light):
-    """Add what one light, asked for by chance, sends to v by way of x, weighed against `seen_along`."""
+    """Add the light of one sampled lamp or sky direction that x reflects to v, weighted against `seen_along`."""
     q = -1
     if choice < scene.asked[0]:
         q, target = lamp_point(scene, choice, u1, u2)
@@ -213,7 +213,7 @@ def reflect_rays(
 
     From frame points (n, 3) with normals (n, 3), seen from the unit directions `view` (n, 3), all under one row of
     levels; `alpha` (n,) as in `lobe`, `within` (n,) as in `walk`; `first` (2,) the first ray and one beyond the last.
-    `throughput` (3,) is room to write into.
+    `throughput` (3,) is scratch memory.
     """
     asks = scene.lamps.shape[0] > 0 or scene.asked[0] < 1.0
     for i in range(ids.shape[0]):
@@ -237,10 +237,10 @@ def reflect_rays(
 
 @jit
 def cast_layers(scene, level, origin, direction, start, t, number, what, normal, within, weight):
-    """What frame rays (n, 3) from an eye meet, one behind the other through films: L layers, (L, n) each.
+    """Surfaces that frame rays (n, 3) from an eye meet, one behind another through films: L layers, (L, n) each.
 
     `start` (n,) has the bits of the fields whose shells they start in. Fills t, number, what, normal, the bits `within`
-    with which each is met, and the `weight` with which it is seen. Of quads fronts only are seen.
+    with which each is met, and the `weight` with which it is seen. Quads are seen from the front only.
     """
     fields, none = scene.twin.shape[0], (0.0, 0.0, 0.0)
     for i in range(origin.shape[0]):
@@ -252,7 +252,7 @@ def cast_layers(scene, level, origin, direction, start, t, number, what, normal,
             if kind != MISS:
                 x = (x[0] + step * d[0], x[1] + step * d[1], x[2] + step * d[2])
             if kind == QUAD and dot(scene.quad_normal[met - fields], d) >= 0.0:
-                on = met  # a wall seen from behind is not there
+                on = met  # a wall is not drawn from behind
                 continue
             t[layer, i], number[layer, i], what[layer, i] = passed, met, kind
             within[layer, i], weight[layer, i] = bits, seen

@@ -4,8 +4,8 @@ Numba has none, and its loop vectoriser does not find the lanes of a box or tria
 to AVX, SSE or NEON. Each operation is a plain NumPy function which also says how it compiles: with NUMBA_DISABLE_JIT=1
 a kernel runs on arrays of eight instead, bit for bit the same.
 
-Memory is read and written at addresses: an array in the argument of a compiled function costs an atomic count of
-references at every call, and arrays inside a tuple cost one each.
+Memory is read and written at addresses: an array argument of a compiled function costs an atomic reference count at
+every call, and each array inside a tuple another.
 """
 
 import hashlib
@@ -27,25 +27,25 @@ WIDE = 8
 
 
 def cached(*sources: ModuleType, **options: Any) -> Callable[[Any], Any]:
-    """Compile a function into a disk cache that sees edits in other modules, and another Numba, too.
+    """Compile a function with a disk cache that notices edits in other modules, and another version of Numba.
 
     Parameters
     ----------
     *sources : module
-        All whose functions end up in the compiled code, except the function's own module and what is frozen.
+        All modules whose functions end up in the compiled code, except the function's own and frozen ones.
     **options
-        More for Numba.
+        Further options of Numba.
 
     Returns
     -------
     callable
         A decorator.
     """
-    # Numba takes compiled code from the disk if the file that holds the function is still the same: by its contents
-    # (0.68), by its time and size (0.61). What else went into the code is not asked, so an upgrade that changes only
-    # another file would run the old code. And where two processes find the code of another version of Numba, one writes
+    # Numba takes compiled code from the disk if the file that contains the function is unchanged: by its contents
+    # (0.68), by its time and size (0.61). It ignores what else went into the code, so an upgrade that changes only
+    # another file would run the old code. And if two processes find the code of another version of Numba, one writes
     # its index anew before it has replaced the code, and the other loads what it cannot read. But the cache's files are
-    # named after the function's qualified name: with a digest in there, what others made is not found. This holds
+    # named after the function's qualified name: with a digest in it, files of others are not found. This holds
     # wherever the cache lies and whatever times an installer sets, and leaves NUMBA_CACHE_DIR and the caches of other
     # packages alone.
     made_of = [numba.__version__, *map(inspect.getsource, sources)]
@@ -78,10 +78,10 @@ class _LanesModel(models.PrimitiveModel):
 
 
 def compiles(function: Any, result: Any, *arguments: Any) -> Any:
-    """Say how `function` compiles for arguments of these types: emit(builder, *values) -> value."""
+    """Register how `function` compiles for arguments of these types: emit(builder, *values) -> value."""
 
     def fit(context: Any, *given: Any) -> Any:
-        # Exactly these types, but any integer for an integer.
+        # Exactly these types, except that any integer type matches an integer.
         if all(
             g == a or (isinstance(a, types.Integer) and isinstance(g, types.Integer)) for g, a in zip(given, arguments)
         ):
@@ -167,7 +167,7 @@ compiles(maximum, FLOATS, FLOATS, FLOATS)(lambda builder, a, b: builder.select(b
 
 
 def muladd(a: Any, b: Any, c: Any) -> Any:
-    """Product a b plus c, rounded once or twice as the processor likes: for bounds only."""
+    """Product a b plus c, rounded once or twice depending on the processor: for bounds only."""
     return a * b + c
 
 
@@ -303,12 +303,12 @@ def _(builder: Any, base: Any, i: Any, values: Any) -> None:
 
 
 def at_least(base: Any, i: Any, rank: Any) -> Any:
-    """Number whose bit k says that byte i + k, of 64 bytes from byte i on, is not below `rank`."""
+    """Number whose bit k is set if byte i + k, of 64 bytes from byte i on, is not below `rank`."""
     return np.packbits(base[i : i + 64] >= rank, bitorder="little").view(np.uint64)[0]
 
 
 def count_below(base: Any, i: Any, rank: Any) -> Any:
-    """How many of the eight bytes from byte i on are below `rank`."""
+    """Number of the eight bytes from byte i on that are below `rank`."""
     return int((base[i : i + 8] < rank).sum())
 
 

@@ -1,4 +1,4 @@
-"""The error of a mean over paths of a Sobol' net, in NumPy: the twin of `kernels.moments` for `reference`."""
+"""The error of a mean over paths of a Sobol' net, in NumPy: the counterpart of `kernels.moments` for `reference`."""
 
 import numpy as np
 
@@ -8,7 +8,7 @@ from illumgrid.rng import net_size, sharing
 
 
 def mixed_differences(worth: Floats, many: int) -> Floats:
-    """Variance (n, C) of a path as four of a net (paths, n, C) in one box tell it: `kernels.mixed_differences`."""
+    """Variance (n, C) of a path from mixed differences in a net (paths, n, C): see `kernels.mixed_differences`."""
     last = len(worth).bit_length() - 3
     i, squarest = np.arange(len(worth) // 4), (last + 1) // 2
     shapes = []
@@ -20,7 +20,7 @@ def mixed_differences(worth: Floats, many: int) -> Floats:
 
 
 def net_variance(worth: Floats) -> Floats:
-    """Variance (n, C) of independent paths that would be as far off as a net (paths, n, C): `kernels.net_variance`."""
+    """Variance (n, C) with which independent paths would have a net's error (paths, n, C): `kernels.net_variance`."""
     if len(worth) == 2:
         return np.asarray((worth[0] - worth[1]) ** 2 / 2)
     many = 2 if len(worth) > 64 and len(worth).bit_length() % 2 == 0 else 3
@@ -33,7 +33,7 @@ def net_variance(worth: Floats) -> Floats:
 
 
 def sum_variance(worth: Floats, first: int) -> Floats:
-    """Variance (n, C) of the sum of paths (paths, n, C) number `first` on, as the nets in that range tell it."""
+    """Variance (n, C) of the sum of paths (paths, n, C) number `first` on, from the nets in that range."""
     count, total, known, at = len(worth), np.zeros(worth.shape[1:]), 0, 0
     while at < count:
         size = net_size(first + at, count - at)
@@ -47,7 +47,7 @@ def sum_variance(worth: Floats, first: int) -> Floats:
 
 
 def spread(worth: Floats, first: int, sky: Floats, lamplight: Floats) -> Floats:
-    """The m2 (n, C) of the mean of paths (paths, n, C) number `first` on, in such light (C,): `kernels.moments`."""
+    """m2 (n, C) of the mean of paths (paths, n, C) number `first` on, given the light (C,): see `kernels.moments`."""
     count, usual = len(worth), np.maximum(worth.mean(axis=0), sky)
     unseen = (UNSEEN * usual) ** 2 + np.maximum(0.0, worth.max(axis=0) - usual) ** 2 + lamplight**2
     return np.asarray((sum_variance(worth, first) + unseen) * (count - 1) / count)

@@ -1,7 +1,7 @@
-"""What the path loop asks of the surface that stands for a level set; the answer depends on the type of the scene.
+"""Operations of the path loop on the surface that represents a level set; the type of the scene selects them.
 
-Two surfaces answer: `march` for a scene that is `illumgrid.field.levelset.Marchable`, and `mesh.cast` for one that is
-`mesh.meshes.Meshed`. Only the answers that a scene's type asks for are compiled.
+There are two: `march` for a scene of type `illumgrid.field.levelset.Marchable`, and `mesh.cast` for
+`mesh.meshes.Meshed`. Only the operations for the type in use are compiled.
 """
 
 from functools import singledispatch
@@ -17,7 +17,7 @@ _OPTIONS = {
 
 
 def question(stub: Any) -> Any:
-    """Make a stub a generic function of the scene's type, as kernels compile and as plain Python."""
+    """Make a stub a generic function of the scene's type, both compiled and as plain Python."""
     generic = singledispatch(stub)
 
     @overload(generic, jit_options=_OPTIONS)  # type: ignore[arg-type]
@@ -48,4 +48,4 @@ def inside(scene, f, level, x, n):
 
 @question
 def begin(scene, own, x, n):
-    """Move a query from the trilinear level set onto the surface that stands for it: (position, face); LOST if none."""
+    """Move a query from the trilinear level set onto the surface that represents it: (position, face); LOST if none."""

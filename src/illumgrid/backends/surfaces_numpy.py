@@ -1,4 +1,4 @@
-"""What rays meet first, in pure NumPy: fields, quads, and what lies behind films."""
+"""The first surface that rays meet, in pure NumPy: fields, quads, and surfaces behind films."""
 
 from collections.abc import Callable
 from typing import Protocol
@@ -12,11 +12,11 @@ from illumgrid.field.volume import Floats
 
 
 class Surfaces(Protocol):
-    """The solids of all fields, as rays meet them. A `face` is the axis of a cap, or the face of a mesh, or NOWHERE."""
+    """The solids of all fields. A `face` is the axis of a cap, or the face of a mesh, or NOWHERE."""
 
     @property
     def scene(self) -> Marchable:
-        """All else that there is."""
+        """The rest of the scene."""
 
     def meet(
         self, f: int, level: Floats, x: Floats, normal: Floats, d: Floats, own: Bools, face: Ints
@@ -27,7 +27,7 @@ class Surfaces(Protocol):
         """Normals (n, 3) where rays along d met field f at x."""
 
     def begin(self, own: Ints, x: Floats, normal: Floats) -> tuple[Floats, Ints]:
-        """Move queries onto the surface that stands for their level set: (position, face); LOST if there is none."""
+        """Move queries onto the surface that represents their level set: (position, face); LOST if there is none."""
 
     def inside(self, f: int, level: Floats, x: Floats, normal: Floats) -> Bools:
         """Whether points x on other surfaces lie inside the solid of field f."""
@@ -36,7 +36,7 @@ class Surfaces(Protocol):
 def meet_quad(scene: Marchable, q: int, x: Floats, d: Floats) -> Floats:
     """Distance (n,) at which frame rays meet quad q, inf if they do not.
 
-    What lies on the quad but for a rounding error is in front of it: a ray that leaves for the back meets it at once.
+    A point on the quad up to a rounding error counts as in front of it: a ray towards the back meets it at once.
     """
     offset = x - scene.quad_corner[q]
     approach, height = d @ scene.quad_normal[q], offset @ scene.quad_normal[q]
@@ -88,7 +88,7 @@ def nearest_hit(
 
 
 def lets_through(scene: Marchable, number: Ints, what: Ints) -> Floats:
-    """Share (n,) of the light that goes straight through what rays met."""
+    """Share (n,) of the light that passes straight through the surfaces that rays met."""
     share = np.zeros(len(number))
     if len(scene.transmission):
         film = ((what == SURFACE) | (what == CAP)) & (number >= 0) & (number < len(scene.twin))
@@ -100,7 +100,7 @@ def followed(
     surfaces: Surfaces, level: Floats, x: Floats, normal: Floats, d: Floats, on: Ints, on_face: Ints, within: Ints,
     passes: Callable[[int, Ints, Floats], Bools],
 ) -> tuple[Floats, Ints, Ints, Ints]:  # fmt: skip
-    """As `nearest_hit`, after films: rays (m,) of those shares go through number k where passes(k, rays, shares) is so.
+    """Like `nearest_hit`, beyond films: rays (m,) of these shares pass number k where passes(k, rays, shares) is true.
 
     `within` (n,) changes with them.
     """

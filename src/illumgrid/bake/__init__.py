@@ -1,4 +1,4 @@
-"""The chain: ask, answer, combine, fill. No disk, no names of stages, no screen."""
+"""From scene and stages to grids: sample queries, solve them, combine, fill. No disk, no names of stages, no output."""
 
 import time
 from collections.abc import Iterable, Sequence
@@ -21,22 +21,22 @@ from illumgrid.transport.walk import Keeper, in_order
 
 @dataclass(frozen=True, eq=False)
 class Baked:
-    """Light for every field, and how it came about.
+    """Light for every field, and how it was computed.
 
     Parameters
     ----------
     grids : tuple of IlluminationGrid
-        One a field.
+        One per field.
     walls : tuple of WallTexture
-        One a quad.
+        One per quad.
     seconds : dict
         Wall time of each stage.
     queries : int
         Number of queries answered, texels among them.
     paths : int
-        Paths walked from each of a field's.
+        Paths per query of a field.
     texels : int
-        Queries on walls, and paths walked from each.
+        Queries on walls, and paths per such query.
     holes : tuple of int
         For each field, nodes that its isosurfaces can show and no sample supports.
     """
@@ -52,7 +52,7 @@ class Baked:
 
 
 def holes_within_range(scene: Scene, field: int, grid: IlluminationGrid) -> int:
-    """Nodes without support through which an isosurface of the range passes, outside the solids of other fields."""
+    """Unsupported nodes through which an isosurface of the range passes, outside the solids of other fields."""
     own = scene.fields[field]
     empty = np.flatnonzero(grid.dark & reached(own, grid.spec))
     nodes = grid.spec.nodes(empty)
@@ -88,7 +88,7 @@ def bake(
     ----------
     scene : Scene
     specs : sequence of GridSpec
-        The nodes, one lattice a field.
+        The nodes, one lattice per field.
     levels : Levels
         Rows of the sweep at which the walls are lit.
     sampler, interpolator
@@ -96,16 +96,16 @@ def bake(
     tracer : Tracer
         A backend with the scene set up: `illumgrid.transport.tracer.prepare`.
     paths : iterable of range
-        Numbers of the paths from every node, one range after the other; the next is asked for when one is walked.
-        A texel has `texel_paths` times as many.
+        Numbers of the paths from every node, one range after the other; the next range is requested when one is done.
+        A texel gets `texel_paths` times as many.
     bounces : int
     seed : int
     map : callable, optional
-        What spreads the batches: the built-in ``map``, or that of an executor or cluster.
+        Applies a function to batches: the built-in ``map``, or that of an executor or cluster.
     progress : callable, optional
         Called with (what, done, total).
     keep : Keeper, optional
-        Keeps the light as it is computed, from coarse to fine, and knows that of a run that was stopped.
+        Keeps the light as it is computed, from coarse to fine, and returns that of a stopped run.
     """
     clock = [time.perf_counter()]
     nodes = node_queries(scene, specs, sampler, seed)

@@ -1,4 +1,4 @@
-"""Light at some targets and the paths it comes from: more paths are walked, combined, stored and taken up."""
+"""Light at some targets with its paths: more paths are traced and combined; the state can be stored and restored."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
@@ -15,11 +15,11 @@ from illumgrid.transport.tracer import Tracer, answered
 from illumgrid.transport.walk import AT_ONCE, Chooser, Keeper, Ranks, Walk, answer, split
 
 Progress = Callable[[str, int, int], None]
-"""Called with what is being done, how much of it is done, and how much there is."""
+"""Called with a description, the amount done, and the total amount."""
 
 
 class Map(Protocol):
-    """Like the built-in ``map``: results in the order of the work. An executor's ``map`` will do."""
+    """Like the built-in ``map``: results in the order of the work, such as an executor's ``map``."""
 
     def __call__(self, function: Callable[[Any], Any], work: Iterable[Any], /) -> Iterable[Any]:
         """Apply `function` to each piece of `work`."""
@@ -34,7 +34,7 @@ QUERY_ARRAYS = tuple(f.name for f in fields(Queries))
 
 @dataclass(frozen=True, eq=False)
 class Bake:
-    """Light at some targets and the paths it comes from: walks more paths, combines, and can be stored.
+    """Light at some targets with its paths: traces more paths, combines them, and can be stored.
 
     Parameters
     ----------
@@ -46,7 +46,7 @@ class Bake:
     answers : tuple of Samples
         Moments of the light, one per batch; empty before the first walk.
     walked : tuple of range
-        Numbers of the paths walked, disjoint.
+        Numbers of the paths traced, disjoint.
     """
 
     targets: tuple[Queries, ...]
@@ -58,12 +58,12 @@ class Bake:
 
     @classmethod
     def of(cls, targets: Sequence[Queries], bounces: int, seed: int) -> "Bake":
-        """Begin with targets that are all equal."""
+        """Begin with targets of equal weight."""
         return cls(tuple(targets), (1,) * len(targets), bounces, seed)
 
     @property
     def paths(self) -> int:
-        """Paths walked from a target of weight 1."""
+        """Paths traced from a target of weight 1."""
         return sum(map(len, self.walked))
 
     @property
@@ -81,9 +81,9 @@ class Bake:
         ranks: Ranks | None = None,
         choose: Chooser | None = None,
     ) -> "Bake":
-        """Walk the paths with these numbers from every target as well; see `bake` for the others.
+        """Trace the paths with these numbers from every target, in addition; see `bake` for the other arguments.
 
-        In the order of `ranks`; or, with a `map` that takes one piece after the other, as is chosen then.
+        In the order of `ranks`; with a `map` that takes one piece after another, each piece is chosen when it is taken.
         """
         ranges = [range(n * paths.start, n * paths.stop) for n in self.weights]
         going = Walk(self.targets, ranges, split(keep.known(paths) if keep else None, self.targets))
@@ -112,14 +112,14 @@ class Bake:
             answered.reset(before)
             if keep:
                 keep.flush()
-        each = (  # a batch of no targets makes no piece of work
+        each = (  # a batch without targets makes no piece of work
             tracer.solve(q, paths=r, bounces=self.bounces, seed=self.seed) if a is None else a
             for a, q, r in zip(going.answers, self.targets, ranges)
         )
         return self.merge(replace(self, answers=tuple(each), walked=(paths,)))
 
     def merge(self, other: "Bake") -> "Bake":
-        """Combine with a bake of the same targets and seed that walked other paths."""
+        """Combine with a bake of the same targets and seed that traced other paths."""
         if (self.bounces, self.seed) != (other.bounces, other.seed):
             raise BadInput(
                 f"a bake of {self.bounces} bounces and seed {self.seed} met one of {other.bounces} and {other.seed}; "
@@ -133,7 +133,7 @@ class Bake:
         return replace(other, answers=answers, walked=self.walked + other.walked)
 
     def state(self) -> dict[str, NDArray[Any]]:
-        """All that the bake holds, as plain arrays: `from_state` takes them back."""
+        """The whole state as plain arrays: see `from_state`."""
         queries = join_queries(self.targets or (NO_QUERIES,))
         arrays = {name: getattr(queries, name) for name in QUERY_ARRAYS}
         if self.answers:
@@ -150,7 +150,7 @@ class Bake:
 
     @classmethod
     def from_state(cls, arrays: Mapping[str, NDArray[Any]]) -> "Bake":
-        """Take up a bake where `state` left it."""
+        """Restore a bake from its `state`."""
         queries = Queries(*(arrays[name] for name in QUERY_ARRAYS))
         ends = np.cumsum(arrays["batches"]).tolist()
         rows = [slice(a, b) for a, b in zip([0, *ends], ends)]

@@ -1,4 +1,4 @@
-"""What is lit ahead of a bake: a coarse grid in whose light paths end, a look that chooses the nodes, or nothing."""
+"""Light computed before a bake: a coarse grid in which paths end, a first look that chooses the nodes, or nothing."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -27,22 +27,22 @@ from illumgrid.transport.stages import capabilities
 from illumgrid.transport.tracer import Tracer, ending_in
 
 BY_NORMAL: tuple[Interpolator, int] = Bilateral(1.0), 16
-"""What reads nodes by level and normal, and how many paths suffice for it, which takes the mean of those around."""
+"""The interpolator for noisy data, and the number of paths that suffices for it, since it averages neighbours."""
 
 
 @dataclass(frozen=True, eq=False)
 class Ahead:
-    """What a bake asks and by what, and what was lit ahead of it."""
+    """The queries and stages of a bake, and the light that was computed before it."""
 
     specs: Sequence[GridSpec]
     sampler: Sampler
     tracer: Tracer
     interpolator: Interpolator
-    cached: bool = False  # whether paths end in light that is known
+    cached: bool = False  # whether paths end in the light of a cache
     refined: dict[str, Any] | None = None  # the nodes that a first look chose
     paths: int = PATHS
-    bounces: int = 0  # that its paths follow
-    name: str = ""  # of what was lit ahead
+    bounces: int = 0  # number of reflections that its paths follow
+    name: str = ""  # of the light computed before
 
     @property
     def levels(self) -> int:
@@ -54,8 +54,8 @@ def light_ahead(
     scene: Scene, specs: Sequence[GridSpec], levels: Levels, tracer: Tracer, stages: tuple[Any, Any, Any], *,
     refining: bool, cached: bool, automatic: bool, bounces: int, **how: Any,
 ) -> Ahead:  # fmt: skip
-    """A coarse grid in whose light paths end, a first look that chooses the nodes, both, or neither."""
-    in_look = refining and automatic and hasattr(tracer, "cache")  # its light costs nothing more
+    """Compute a coarse grid in which paths end, a first look that chooses the nodes, both, or neither."""
+    in_look = refining and automatic and hasattr(tracer, "cache")  # the look has its light anyway
     ending = tracer
     if cached and not in_look:
         ending = light_known_first(scene, specs, levels, tracer, bounces=bounces, **how)
@@ -63,7 +63,7 @@ def light_ahead(
         return Ahead(specs, stages[0], ending, stages[2], cached, bounces=bounces, name="cache" if cached else "")
     nodes = chosen(scene, specs, halvings(specs), ending, bounces=2 * bounces, **how)
     if in_look:
-        ending = ending_in(cache_of(scene, nodes.looked, (), ROUGH), tracer)  # what is lit more finely ends none
+        ending = ending_in(cache_of(scene, nodes.looked, (), ROUGH), tracer)  # no path ends in a cell that is refined
     return Ahead(
         [finer(spec, nodes.levels) for spec in specs], Chosen(nodes.flat), ending, Nested(nodes.levels),
         cached or in_look, written(nodes, specs), nodes.paths, bounces, "look",
@@ -93,21 +93,21 @@ def nodes_to_light(scene: Scene, ahead: Ahead) -> int:
 
 
 def refinable_by(scene: Scene, sampler: Any, backend: Any, interpolator: Any) -> bool:
-    """Whether nodes are lit where the light is rough: under one light, by the default stages.
+    """Whether nodes are refined where the light is rough: under one light, with the default stages.
 
-    In the studio, whose key casts sharp shadows, it gained little for more time.
+    In the studio, whose key casts sharp shadows, refinement gained little for its time.
     """
     return len(layers_of(scene)) == 1 and _free(scene, sampler, backend, interpolator)
 
 
 def by_normal_in(scene: Scene, sampler: Any, backend: Any, interpolator: Any) -> bool:
-    """Whether nodes are read by level and normal: noisy data under several lights, by the default stages."""
+    """Whether `bilateral` is used: for noisy data under several lights, with the default stages."""
     several = len(layers_of(scene)) > 1
     return several and _free(scene, sampler, backend, interpolator) and all(map(noisy, scene.fields))
 
 
 def _free(scene: Scene, sampler: Any, backend: Any, interpolator: Any) -> bool:
-    """Whether a run may choose: no stage is asked for, no walls are there, and all isovalues sweep together."""
+    """Whether a run may choose: no stage was requested, there are no walls, and all isovalues sweep together."""
     can = capabilities(backend)
     return (
         not scene.quads

@@ -9,17 +9,17 @@ from illumgrid.transport.samples import Queries, join_queries
 from illumgrid.transport.tracer import Tracer
 
 LEAST = 8
-"""Reflections at least: the mean that is left out is less than what deep folds lose, and long paths are few."""
+"""Least number of reflections: deep folds lose more than the mean, and long paths are few."""
 SHORT = 4
 """Reflections that bring 99 % of the light where paths are short."""
 LEFT_OUT = 0.01
 
 
 def _on_few_rows(scene: Scene, seed: int, rows: int = 4, count: int = 32) -> Queries:
-    """About `count` queries on each of a few rows of the sweep, from the nodes of a coarse grid.
+    """About `count` queries on each of a few rows of the sweep, at the nodes of a coarse grid.
 
-    Few, because a backend of meshes builds one per row. The nodes of all fields, sorted by their place in the sweep,
-    are cut into equal parts; those nearest to the middle of a part move onto its row.
+    Few rows, because a backend that traces meshes builds one per row. The nodes of all fields, sorted by their position
+    in the sweep, are divided into equal parts; those nearest to the middle of a part move onto its row.
     """
     specs = [GridSpec.over(field.volume, 10) for field in scene.fields]
     nodes = join_queries([q for q in Direct().queries(scene, specs, seed) if len(q)])
@@ -27,7 +27,7 @@ def _on_few_rows(scene: Scene, seed: int, rows: int = 4, count: int = 32) -> Que
     for number, field in enumerate(scene.fields):
         own = nodes.target == number
         place[own] = field.place(nodes.level[own, number])
-    shuffled = np.random.default_rng(seed).permutation(len(nodes))  # many stand at an end of the range
+    shuffled = np.random.default_rng(seed).permutation(len(nodes))  # many lie at an end of the range
     asked = []
     for number, part in enumerate(np.array_split(shuffled[np.argsort(place[shuffled], kind="stable")], rows)):
         middle = place[part[len(part) // 2]] if len(part) else 0.0
@@ -56,7 +56,7 @@ def light_left_out(scene: Scene, tracer: Tracer, bounces: int, seed: int = 0) ->
 
 
 def enough_bounces(scene: Scene, tracer: Tracer, seed: int = 0, limit: float = LEFT_OUT) -> tuple[int, float]:
-    """Reflections to follow, and the share of light left out: below the limit, and at least `LEAST` reflections."""
+    """Number of reflections that leaves out less light than the limit, at least `LEAST`, and the share left out."""
     bounces, left_out = LEAST, light_left_out(scene, tracer, LEAST, seed)
     while bounces < 128 and left_out >= limit:
         bounces += max(1, bounces // 4)
@@ -65,5 +65,5 @@ def enough_bounces(scene: Scene, tracer: Tracer, seed: int = 0, limit: float = L
 
 
 def has_long_paths(scene: Scene, tracer: Tracer, seed: int = 0) -> bool:
-    """Whether light needs many reflections: a coarse grid then pays that is lit first, since most paths end there."""
+    """Whether light needs many reflections: then lighting a coarse grid first pays off, since most paths end there."""
     return light_left_out(scene, tracer, SHORT, seed) >= LEFT_OUT

@@ -1,4 +1,4 @@
-"""A coarse grid first, in whose light the paths of the fine one end."""
+"""A coarse grid that is lit first, in which the paths of the fine one end."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -13,26 +13,26 @@ from illumgrid.samplers.direct import Direct
 from illumgrid.transport.tracer import Tracer, ending_in
 
 COARSE, COARSE_PATHS = 0.7, 4
-"""Nodes of a cache for each node along an axis, and paths from each."""
+"""Nodes of a cache relative to those of the grid, along an axis, and paths per node."""
 
 MOST_BIAS = 0.003
-"""Of the mean light: by how much paths that end in a cache may be off in the mean; a test holds it on four scenes."""
+"""Largest bias of paths that end in a cache, relative to the mean light; a test checks it on four scenes."""
 
 
 def light_known_first(
     scene: Scene, specs: Sequence[GridSpec], levels: Levels, tracer: Tracer, *, bounces: int, seed: int, **how: Any
 ) -> Tracer:
-    """The same tracer, whose paths end in the light of a coarser grid, which is computed here: every bounce at once.
+    """The same tracer, whose paths end in the light of a coarser grid, which is computed here.
 
-    The coarse light has paths of its own, random numbers of its own, and the same walls for every other row of levels.
+    The coarse light has its own paths and random numbers, and walls at every other row of levels.
 
     Parameters
     ----------
     specs : sequence of GridSpec
-        Nodes that are to be lit afterwards.
+        Nodes that will be lit afterwards.
     bounces : int
-        Of the paths that are to be walked. Those of the cache have twice as many: the light falls by the same factor
-        with each, so that these leave out the square of what those do.
+        Of the paths that will be traced. Those of the cache have twice as many: the light falls by the same factor with
+        each bounce, so the share that they omit is the square of the share omitted by `bounces`.
     **how
         `map` and `progress` of `bake`.
     """

@@ -1,4 +1,4 @@
-"""Where to light a fine lattice: a few paths from the nodes of a coarse one show where the light is rough."""
+"""Where to light a finer lattice: a few paths from the nodes of a coarse one show where the light is rough."""
 
 import base64
 import zlib
@@ -21,27 +21,27 @@ from illumgrid.transport.samples import Queries, combine
 from illumgrid.transport.tracer import Tracer
 
 FEW, STORED = 0.02, 75
-"""A level is not worth a grid of eight times the size if it has fewer than this share of the lit nodes, or if the grid
-would have more nodes than so many for each lit one."""
+"""A halving, which makes the lattice eight times as large, is left out if it has fewer than this share of the lit
+nodes, or if the grid would store more than this number of nodes for each lit one."""
 LOOKED = 4
-"""Paths from each node that show where light is rough."""
+"""Paths per node of a first look."""
 ROUGH = 0.1
-"""Of the mean light: cells whose corners differ by more, beyond their noise, are lit at twice the nodes."""
+"""Of the mean light: cells whose corners differ by more than this and their noise are refined."""
 NOISE = 3.0
-"""Standard errors by which eight corners of equal light differ, about: the range of eight normal numbers is 2.85."""
+"""Approximate range, in standard errors, of eight corners of equal light: 2.85 for eight normal numbers."""
 MOST = 4.0
-"""Nodes lit in all, at most, for each of the coarse lattice."""
+"""Nodes lit in total, at most, for each of the coarse lattice."""
 PATH_COUNTS = 8, 16, 32, 64
-"""Paths from each node, of which one is chosen; in all at most the last for each coarse node."""
+"""Candidates for the paths per node; in total at most the last for each coarse node."""
 BESIDE = 16.0
-"""Paths that take as long as all else that a node costs: to look, to ask and to read."""
+"""Paths that take as long as everything else that a node costs: first look, query and filter."""
 SHARED = 0.5
-"""Share of its nodes' variance that a lookup keeps: 8/27 of noise that they do not share, all of what they share."""
+"""Share of its nodes' variance that a lookup keeps: 8/27 for independent noise, all for shared noise."""
 
 
 @dataclass(frozen=True, eq=False)
 class Chosen:
-    """A sampler that asks at some nodes, as `Direct` would.
+    """A sampler with the queries of `Direct` at some nodes.
 
     Parameters
     ----------
@@ -65,21 +65,21 @@ class Choice:
     levels: int
     flat: tuple[NDArray[np.int64], ...]  # numbers in each field's lattice
     paths: int = PATH_COUNTS[-1]  # from each of them
-    looked: tuple[IlluminationGrid, ...] = ()  # light of the coarsest lattices by a few paths
+    looked: tuple[IlluminationGrid, ...] = ()  # light of the coarsest lattices from a few paths
 
 
 @dataclass(frozen=True)
 class Seen:
-    """What a first look says about the error of a lookup: squares, relative to the mean light.
+    """The error of a lookup as estimated by a first look: squares, relative to the mean light.
 
     Parameters
     ----------
     noise : float
-        Of one path.
+        Variance of one path.
     between : float
-        What interpolation between the nodes of the coarsest lattice is off.
+        Squared error of interpolation between the nodes of the coarsest lattice.
     falls : float
-        By what this is divided when the spacing is halved: 2 where light jumps, 16 where it is smooth.
+        Factor by which `between` falls when the spacing is halved: 2 where light jumps, 16 where it is smooth.
     """
 
     noise: float
@@ -90,10 +90,10 @@ class Seen:
     def of(cls, one: NDArray[np.floating], other: NDArray[np.floating]) -> "Seen":
         """From light (nx, ny, nz) by independent paths, two from each node; NaN where there is none.
 
-        In the mean product of second differences noise cancels. Half a second difference is what linear interpolation
-        is off at a node, had it twice the spacing, and about two thirds of its square the mean square between nodes:
-        with twice the spacing, a sixth of those products, summed over the axes, and less by `falls` with the spacing
-        that there is. `falls` is how much larger the products are two nodes apart.
+        In the mean product of second differences noise cancels. Half a second difference is the error at a node of
+        linear interpolation at twice the spacing; two thirds of its square are about the mean square between nodes. At
+        twice the spacing, the squared error is thus a sixth of those products, summed over the axes; at the actual
+        spacing it is smaller by `falls`, the ratio of the products two nodes apart to those one node apart.
         """
         mean = float(np.nanmean(one + other)) / 2 if np.isfinite(one).any() else 0.0
         if not mean > 0:
@@ -103,10 +103,11 @@ class Seen:
         return cls(SHARED * float(np.nanmean(np.square(one - other))) / mean**2, max(near, 0.0) / 6 / falls, falls)
 
     def cost(self, nodes: Sequence[int], paths: int) -> float:
-        """The time of these paths from the nodes of all levels, times the fourth power of the error; 0 is best.
+        """Time of these paths from the nodes of all levels, times the fourth power of the error; smaller is better.
 
-        `nodes` are those of the coarsest level, and with each finer one. Where light jumps, half the spacing takes four
-        times the nodes and halves the squared error: that is the price of accuracy. Infinite for too many paths in all.
+        `nodes` are the numbers of nodes of the coarsest level, and of all levels up to each finer one. Where light
+        jumps, half the spacing takes four times the nodes and halves the squared error; hence the fourth power.
+        Infinite for too many paths in total.
         """
         if paths > PATH_COUNTS[0] and paths * nodes[-1] > PATH_COUNTS[-1] * nodes[0]:
             return np.inf
@@ -114,7 +115,7 @@ class Seen:
         return float(square**2 * nodes[-1] * (BESIDE + paths))
 
     def paths(self, nodes: Sequence[int]) -> int:
-        """Paths from each node, by which the cost is least: powers of two, which spread best; most where all are 0."""
+        """Paths per node with the least cost: powers of two, which are spread best; the most if all costs are 0."""
         return min(reversed(PATH_COUNTS), key=lambda paths: self.cost(nodes, paths))
 
 
@@ -139,12 +140,12 @@ def chosen(
     map: Map = map,
     progress: Progress = lambda what, done, total: None,
 ) -> Choice:
-    """Choose the nodes to light, from the coarse lattices `base` on and with at most so many levels, and their paths.
+    """Choose the nodes to light, from the coarse lattices `base` with at most `levels` halvings, and their paths.
 
-    All nodes of the coarsest level that an isosurface of the range can show, and, level after level, those of the next
-    finer one in cells whose corners differ by more than `ROUGH` of the mean light beyond noise, the roughest first, up
-    to `MOST` nodes for each of the coarsest level. A level of few nodes is left out, and one that does not pay: see
-    `Seen.cost`. Fields share the number of paths of the one that has the most nodes.
+    Chooses all nodes of the coarsest level that an isosurface of the range can show; then, level by level, nodes of the
+    next finer lattice in cells whose corners differ by more than `ROUGH` of the mean light plus noise, the roughest
+    first, up to `MOST` nodes for each of the coarsest level. A level that has few nodes or does not pay is left out:
+    see `Seen.cost`. All fields get the number of paths of the field with the most nodes.
     """
     looks = [
         _of_field(scene, number, spec, levels, tracer, bounces, seed, map, progress) for number, spec in enumerate(base)
@@ -165,7 +166,7 @@ def _of_field(
     scene: Scene, number: int, spec: GridSpec, levels: int, tracer: Tracer, bounces: int, seed: int, map: Map,
     progress: Progress,
 ) -> tuple[list[NDArray[np.int64]], IlluminationGrid, int]:  # fmt: skip
-    """Nodes of each level, as numbers in its own lattice, the light of the coarsest by a few paths, and how many."""
+    """Nodes of each level, numbered in its own lattice; light of the coarsest from a few paths; paths per node."""
     field = scene.fields[number]
     flat = reachable(field, spec)
     found, lit, room = [flat], [len(flat)], MOST * len(flat)
@@ -179,7 +180,7 @@ def _of_field(
         rough = np.where(all_corners(asked), spread(grid), np.float32(0))
         spec = finer(spec, 1)
         may = reached(field, spec)
-        # Corners differ by their noise, too: that of four paths exceeds all else in a room with a small lamp.
+        # Corners differ by their noise, too: that of four paths exceeds everything else in a room with a small lamp.
         least = ROUGH * grid.mean + NOISE * noise
         more = within(rough > least) & may
         while lit[-1] + int(more.sum()) > room:  # raise the limit until there is room
@@ -200,10 +201,10 @@ def _look(
     scene: Scene, number: int, spec: GridSpec, flat: NDArray[np.int64], tracer: Tracer, bounces: int, seed: int,
     map: Map, progress: Progress,
 ) -> tuple[IlluminationGrid, float, Callable[[], NDArray[np.float32]]]:  # fmt: skip
-    """Light of these nodes by a few paths, with random numbers of their own, and its standard error from noise.
+    """Light of these nodes from a few paths, with random numbers of their own, and the standard error of its noise.
 
-    And what reads the light (n, C) that the first half of the paths alone would have. The halves are independent: those
-    of one sequence are not, as it spreads its paths.
+    Also returns a function that computes the light (n, C) from the first half of the paths alone. The halves have
+    sequences of their own: the paths of one sequence are spread evenly and therefore not independent.
     """
     nodes = Nodes(spec, scene.fields[number], number)
     queries = [NodeQueries(scene, number, spec, flat)]
@@ -214,7 +215,7 @@ def _look(
         for start in (2**59, 3 * 2**59)
     )  # fmt: skip
     samples = combine(one, other)
-    light = np.zeros((*spec.shape, len(samples.channels)), np.float32)  # holes stay dark: nobody reads them
+    light = np.zeros((*spec.shape, len(samples.channels)), np.float32)  # holes stay dark: nothing reads them
     error, support = np.full(spec.shape, np.inf, np.float32), np.zeros(spec.shape, np.float32)
     for every, some in zip((light, error, support), read(samples, nodes, nodes, flat)):
         every.reshape(-1, *every.shape[3:])[flat] = some
@@ -226,17 +227,17 @@ def _look(
 
 
 def _seen(grid: IlluminationGrid, flat: NDArray[np.int64], half: NDArray[np.float32]) -> Seen:
-    """What the light of a grid says, of which half of the paths alone have the light (n, C) at these nodes."""
+    """Estimate the error of a grid, from the light (n, C) at these nodes by half of its paths."""
     whole, one = (np.full(grid.spec.shape, np.nan) for _ in range(2))
     shown = grid.channels.shown
     whole.reshape(-1)[flat] = shown(grid.light.reshape(-1, len(grid.channels))[flat]).mean(axis=-1)
     one.reshape(-1)[flat] = shown(half).mean(axis=-1)
     one[grid.support == 0] = np.nan
-    return Seen.of(one, 2 * whole - one)  # reading is linear in the light
+    return Seen.of(one, 2 * whole - one)  # the filter is linear in the light
 
 
 def written(choice: Choice, base: Sequence[GridSpec]) -> dict[str, Any]:
-    """The choice in what JSON has, for a record of a run."""
+    """The choice in types of JSON, for the record of a run."""
     texts = []
     for flat, spec in zip(choice.flat, base):
         mask = np.zeros(int(np.prod(finer(spec, choice.levels).shape)), bool)
@@ -246,6 +247,6 @@ def written(choice: Choice, base: Sequence[GridSpec]) -> dict[str, Any]:
 
 
 def read_choice(record: Mapping[str, Any]) -> Choice:
-    """The choice that `written` made a record of."""
+    """The choice from a record of `written`."""
     masks = (np.unpackbits(np.frombuffer(zlib.decompress(base64.b85decode(t)), np.uint8)) for t in record["nodes"])
     return Choice(int(record["levels"]), tuple(map(np.flatnonzero, masks)))

@@ -1,4 +1,4 @@
-"""What is asked at nodes, in which order, and what becomes of the answers: the grid of each field."""
+"""Queries at nodes, their order, and the grid of each field from their samples."""
 
 from collections.abc import Iterator, Sequence
 
@@ -14,11 +14,11 @@ from illumgrid.transport.samples import Queries, Samples, join_queries, join_sam
 from illumgrid.transport.stages import fill_nodes
 
 HELD_ROWS = 5
-"""Places of the sweep, its ends among them, at which a level that is held is lit."""
+"""Positions of the sweep, both ends included, at which a held level is lit."""
 
 
 def node_queries(scene: Scene, specs: Sequence[GridSpec], sampler: Sampler, seed: int) -> list[Queries]:
-    """What a sampler asks; of `Direct` only the numbers of nodes are held, and queries for one piece at a time."""
+    """The queries of a sampler; for `Direct` only the numbers of nodes are held, and queries made piece by piece."""
     if type(sampler) is Direct and all(field.isovalue is None for field in scene.fields):
         batches: list[Queries] = [NodeQueries(scene, number, spec) for number, spec in enumerate(specs)]
     else:
@@ -27,9 +27,9 @@ def node_queries(scene: Scene, specs: Sequence[GridSpec], sampler: Sampler, seed
 
 
 def held_queries(scene: Scene, nodes: Sequence[Queries]) -> list[Queries]:
-    """Queries at the nodes of each field whose level is held, with the others at `HELD_ROWS` places of the sweep.
+    """Queries at the nodes of each field whose level is held, the others at `HELD_ROWS` positions of the sweep.
 
-    One batch a field and place, place after place.
+    One batch per field and position, position by position.
     """
     batches = []
     for number, field in enumerate(scene.fields):

@@ -1,4 +1,4 @@
-"""The light of walls: texels that are asked, textures made of the answers, and what these hold at places between."""
+"""The light of walls: queries at texels, textures from their samples, and lookups between texels."""
 
 from collections.abc import Sequence
 
@@ -13,7 +13,7 @@ from illumgrid.transport.samples import Queries, Samples
 
 
 def wall_queries(scene: Scene, levels: Levels) -> list[Queries]:
-    """Queries at the middles of the texels of every quad's front, for every row of levels: one batch a quad."""
+    """Queries at the middles of the texels of every quad's front, for every row of levels: one batch per quad."""
     counts = [len(levels.table) * quad.texels[0] * quad.texels[1] for quad in scene.quads]
     return [at_texels(scene, levels, number, np.arange(count)) for number, count in enumerate(counts)]
 
@@ -34,19 +34,19 @@ def at_texels(scene: Scene, levels: Levels, quad: int, texels: NDArray[np.int64]
 
 
 def texel_paths(nodes: int, texels: int) -> int:
-    """Paths from a texel for each from a node: up to eight, while the walls are no more work than the grids.
+    """Paths from a texel for each from a node: up to eight, unless walls would then take more work than the grids.
 
-    A texel is seen across many pixels, where noise that a curved surface hides shows as blotches.
+    A texel covers many pixels, so its noise shows as blotches that a curved surface would hide.
     """
     return int(np.clip(nodes // max(texels, 1), 1, 8))
 
 
 def wall_texture(rows: int, quad: Quad, answer: Samples) -> WallTexture:
-    """The texture of a quad from the samples at its texels, for so many rows of levels; its noise is calmed."""
+    """The texture of a quad from the samples at its texels, for so many rows of levels, with its noise averaged."""
     nu, nv = quad.texels
     support = (answer.paths > 0).astype(np.float32).reshape(rows, nv, nu)
     texel = np.linalg.norm(quad.edge_v) / nv, np.linalg.norm(quad.edge_u) / nu
-    # Another row is another setting of the sweep: look there last.
+    # Another row is another setting of the sweep: use it last.
     spacing = (1e3 * max(texel) * max(nu, nv), *texel)
     shape = rows, nv, nu
     calm = calmed(
@@ -68,7 +68,7 @@ def place_on_walls(scene: Scene, asked: Queries) -> tuple[NDArray[np.intp], Floa
 
 
 def look_up_walls(scene: Scene, walls: Sequence[WallTexture], asked: Queries) -> Floats:
-    """Light (n, 3) that the textures hold at queries on walls."""
+    """Light (n, 3) of the textures at queries on walls."""
     number, u, v, t = place_on_walls(scene, asked)
     light = np.zeros((len(asked), 3))
     for k in np.unique(number):

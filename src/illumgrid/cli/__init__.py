@@ -56,7 +56,7 @@ def root(
         os.getcwd()
     except OSError:
         raise BadInput(
-            "the working folder is gone: deleted, moved or unmounted; expected one that is there; cd to it"
+            "the working folder is gone: deleted, moved or unmounted; expected one that exists; cd to it"
         ) from None
 
 
@@ -81,25 +81,25 @@ def main() -> None:
 
 
 def in_options(sentence: str) -> str:
-    """A sentence of the library, which speaks of arguments, in the options of the command line."""
+    """Translate arguments of Python in a message into options of the command line."""
     for argument, option in {"overwrite=True": "--overwrite", "another folder": "another folder with -o"}.items():
         sentence = sentence.replace(argument, option)
     return re.sub(r"\bgrid=(\d+)", r"--grid \1", sentence)
 
 
 def guarded(command: Callable[[], Any]) -> int:
-    """Exit code of a command."""
+    """Run a command and return its exit code."""
     disk.written.clear()
     disk.kept.clear()
     try:
         code = command()
-        if code == 130:  # what typer makes of Ctrl-C
+        if code == 130:  # typer turns Ctrl-C into this code
             raise KeyboardInterrupt
         return code if isinstance(code, int) else 0
     except (typer.Abort, KeyboardInterrupt):
         return _stopped()
     except Exception as error:
-        return _stopped() if unanswered[0] else _failed(error)  # libraries make other exceptions of a stop
+        return _stopped() if unanswered[0] else _failed(error)  # libraries may turn a stop into another exception
 
 
 def _stopped() -> int:
@@ -109,7 +109,7 @@ def _stopped() -> int:
 
 
 def _failed(error: Exception) -> int:
-    """Say what was wrong, in a sentence; what nobody expected has a traceback."""
+    """Report an error in one sentence and return 2; unexpected exceptions keep their traceback."""
     if isinstance(error, BadInput):
         say(f"illumgrid: {in_options(str(error))}")
     elif isinstance(error, MemoryError):

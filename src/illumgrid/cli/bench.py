@@ -13,25 +13,27 @@ from illumgrid.cli.terminal import progress_bars, reported_warnings, result, say
 def bench(
     source: Annotated[
         str | None,
-        typer.Argument(metavar="[INPUT]", help="What run takes: a volume, scene file or built-in scene."),
+        typer.Argument(metavar="[INPUT]", help="A volume, scene file or built-in scene, as for run."),
     ] = None,
     limits: Annotated[
         tuple[float, float] | None,
         typer.Option("--range", metavar="LO HI", help="Isovalues to sweep. [default: from the data, as info suggests]"),
     ] = None,
-    budget: Annotated[float, typer.Option(metavar="S", help="Seconds, from compiled kernels on.")] = 100.0,
+    budget: Annotated[
+        float, typer.Option(metavar="S", help="Seconds for the chart; compilation is not counted.")
+    ] = 100.0,
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", metavar="DIR", help="Where the chart goes. [default: INPUT-bench]")
+        Path | None, typer.Option("--output", "-o", metavar="DIR", help="Folder for the chart. [default: INPUT-bench]")
     ] = None,
     reading: dict[str, Any] = NONE,
     smooth: Annotated[
         float | None, typer.Option(min=0.0, metavar="SIGMA", help="Gaussian blur in voxels before anything else.")
     ] = None,
     seed: Annotated[
-        int, typer.Option(min=0, max=2**64 - 1, metavar="N", help="Of the contestants and the reference.")
+        int, typer.Option(min=0, max=2**64 - 1, metavar="N", help="Seed of the contestants and of the reference.")
     ] = 0,
 ) -> None:
-    """Chart seconds against error for everything that is registered, and say which setting to use.
+    """Chart seconds against error for all registered stages, and recommend a setting.
 
     DIR then holds bench.json, bench.csv, chart.png and chart.svg.
     """

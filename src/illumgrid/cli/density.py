@@ -29,10 +29,10 @@ def density(
         typer.Option(metavar="file|L,L,L", help="Periodic cell: that of the file, or its lengths. [default: none]"),
     ] = None,
 ) -> None:
-    """Make a field from points: point masses, spread by a Gaussian.
+    """Make a field from a list of points: each is a mass, spread by a Gaussian.
 
-    The values are weight per volume. Atoms of PDB and mmCIF files count by their occupancy; --weights mass, number or
-    b_factor weighs them otherwise.
+    The values are mass per volume. Atoms of PDB and mmCIF files count by their occupancy; --weights mass, number or
+    b_factor selects another weight.
     """
     from illumgrid.errors import shown_range
     from illumgrid.io import exports

@@ -25,15 +25,16 @@ def export(
     on: Annotated[
         str | None,
         typer.Option(
-            metavar="grid|field", help="Sample at the nodes of the grid or at the voxels of the field. [default: grid]"
+            metavar="grid|field",
+            help="Write values at the nodes of the grid or at the voxels of the field. [default: grid]",
         ),
     ] = None,
     onto: Annotated[
         Path | None,
         typer.Option(
             metavar="MESH",
-            help="Light this mesh, .ply .stl .obj .glb, in place of an isosurface; its vertices lie on level sets of "
-            "the range, with --isovalue on that one.",
+            help="Light this mesh (.ply .stl .obj .glb) instead of an isosurface. Its vertices lie near level sets "
+            "of the range; --isovalue moves them onto one.",
         ),
     ] = None,
     weights: Weights = None,

@@ -1,4 +1,4 @@
-"""Memory that arrays have left goes back to the system."""
+"""Return freed memory to the system."""
 
 import sys
 from typing import Any
@@ -9,7 +9,7 @@ _MMAP_THRESHOLD = -3  # of mallopt, in malloc.h
 
 
 def return_what_is_freed() -> None:
-    """Let each large array have pages of its own, which go with it.
+    """Give each large array pages of its own, which are returned when it is freed.
 
     The allocator of glibc raises that bound by itself, up to 32 MB, and smaller arrays then leave holes in its heap: a
     run of 512³ voxels held 40 MB of them at its peak. Other systems need nothing.
@@ -19,7 +19,7 @@ def return_what_is_freed() -> None:
 
 
 def return_holes() -> None:
-    """Give back whole pages that smaller arrays have left in the heap.
+    """Return whole pages that smaller arrays have left in the heap.
 
     The search for a range on 512³ voxels leaves 52 MB, which a run would hold to its end.
     """

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 BLOCKS = " ▁▂▃▄▅▆▇█"
 PLAIN = " .:-=+*#@"
-"""Where the terminal or the pipe has no block characters."""
+"""For terminals and pipes without block characters."""
 
 MOST = 1 << 27
 """Voxels: a larger image is described from a coarser resolution of it, if the file has one and none is chosen."""
@@ -42,16 +42,16 @@ def info(
     limits: Annotated[
         tuple[float, float] | None,
         typer.Option(
-            "--range", metavar="LO HI", help="Isovalues to sweep, for the warnings. [default: the suggested range]"
+            "--range", metavar="LO HI", help="Isovalues to examine for warnings. [default: the suggested range]"
         ),
     ] = None,
     inside: Annotated[
-        str | None, typer.Option(help="Which side of the isovalue is solid: above, below. [default: above]")
+        str | None, typer.Option(help="Which side of the isosurface is solid: above or below. [default: above]")
     ] = None,
     reading: dict[str, Any] = NONE,
     ignore: Ignore = None,
 ) -> None:
-    """Describe a volume or a finished run; for a volume, suggest a range and warn of what will limit the result."""
+    """Describe a volume or a finished run; for a volume, suggest a range and warn of expected problems."""
     from illumgrid.errors import BadInput
     from illumgrid.io import store
 
@@ -82,7 +82,7 @@ def _describe_volume(source: str, limits: tuple[float, float] | None, inside: "S
 
     labels = labels_of(reading.pop("label", None))
     if len(labels) > 1:
-        raise BadInput(f"--label holds {len(labels)} labels; expected one for info; ask for one after another")
+        raise BadInput(f"--label holds {len(labels)} labels; expected one; call info for each of them")
     enough = None if labels or {"crop", "downsample"} & set(reading) else MOST
     volume = finite(read_volume(source, **reading, label=labels[0] if labels else None, most=enough), inside)
     needs.check("info", needs.of_field(volume.stored.size, needs.TO_DESCRIBE), "cut or --downsample the volume")

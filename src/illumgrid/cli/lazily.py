@@ -1,4 +1,4 @@
-"""Light that is computed while one looks: a page at once, coarse, and finer where it is looked at."""
+"""Light that is computed while somebody looks: a page with coarse light at once, refined first where it is in view."""
 
 import threading
 from collections.abc import Callable, Mapping
@@ -26,7 +26,7 @@ def look(
     scene: "Scene", stages: dict[str, Any], keep: "Partial", numbers: Mapping[str, Any], about: Mapping[str, Any],
     folder: Path, sentences: list[str], opened: bool = True, up: str | None = None,
 ) -> None:  # fmt: skip
-    """Serve a page, and light the scene meanwhile; until Ctrl-C, after which the same command goes on.
+    """Serve a page and light the scene until Ctrl-C; the same command then resumes.
 
     Parameters
     ----------
@@ -68,7 +68,7 @@ def look(
             work.ready = lambda light: setattr(server, "page", page(light, up).encode())
             work.failed = server.shutdown
             work.served.set()
-            say(f"serving {server.address} to this machine only, lighting meanwhile; stop with Ctrl-C")
+            say(f"serving {server.address} to this machine only while it computes light; stop with Ctrl-C")
             if opened:
                 browse(server.address)
             with suppress(KeyboardInterrupt):
@@ -76,7 +76,7 @@ def look(
 
 
 def look_at(source: str, opened: bool, up: str | None) -> Path | None:
-    """Light a volume file, a scene file or a built-in scene while one looks; its folder if nothing is left to do."""
+    """Light an input of `run` while somebody looks; return its folder if nothing is left to do."""
     from illumgrid import registry
     from illumgrid.io import store
 
@@ -99,7 +99,7 @@ def look_at(source: str, opened: bool, up: str | None) -> Path | None:
 
 
 def go_on(place: Path, opened: bool, up: str | None) -> bool:
-    """Go on with a run that is lit while one looks; whether the partial run in `place` is one."""
+    """Resume the partial run in `place` if it is one that is lit while somebody looks; return whether it is."""
     from illumgrid import registry
     from illumgrid.io import partial as kept_runs
     from illumgrid.io import store
@@ -124,18 +124,18 @@ def go_on(place: Path, opened: bool, up: str | None) -> bool:
 
 
 def _check(stages: Mapping[str, Any], scene: "Scene") -> None:
-    """Refuse what cannot be lit a node at a time."""
+    """Refuse stages and lights that cannot be computed node by node."""
     from illumgrid.field.lights import Harmonics
 
     if (stages["sampler"].name, stages["interpolator"].name) != ("direct", "nearest"):
         names = f"{stages['sampler'].name} and {stages['interpolator'].name}"
         raise BadInput(f"--lazy came with {names}; expected direct and nearest, whose nodes are lit one by one")
     if any(isinstance(light, Harmonics) for light in scene.lights):
-        raise BadInput("--lazy came with --lights sh; expected lights that are shown as they are; leave one out")
+        raise BadInput("--lazy came with --lights sh; expected one of them")
 
 
 def browse(address: str) -> None:
-    """Open a browser; in a thread: one that runs until its window closes would wait for a page that nobody serves."""
+    """Open a browser in a thread: some return only when their window closes, and the page must be served."""
     import webbrowser
 
     threading.Thread(target=webbrowser.open, args=(address,), daemon=True).start()
@@ -159,7 +159,7 @@ class _Work:
         return self
 
     def __exit__(self, *stopped: object) -> None:
-        """Let the piece at hand end, and what is lit be kept."""
+        """Wait for the current piece, and keep the finished light."""
         answered()
         self.live.stop.set()
         while self.thread.is_alive():
@@ -173,7 +173,7 @@ class _Work:
             say(kept if place.is_dir() else "stopped before there was light everywhere; nothing is kept")
 
     def first(self) -> bool:
-        """Wait until there is light everywhere; whether there is."""
+        """Wait until every fourth node is lit; return whether it is."""
         with suppress(KeyboardInterrupt):
             while self.thread.is_alive() and not self.live.coarse.wait(0.05):
                 pass
@@ -195,7 +195,7 @@ class _Work:
     def _progress(self, what: str, done: int, total: int) -> None:
         from illumgrid.live import Stopped
 
-        # Once there is light everywhere, both processors make the page of it.
+        # Once there is light everywhere, all processors work on the page.
         while self.live.coarse.is_set() and not self.live.stop.is_set() and not self.served.wait(0.05):
             pass
         if self.live.stop.is_set() and not self.live.ended:

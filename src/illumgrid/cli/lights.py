@@ -13,13 +13,19 @@ if TYPE_CHECKING:
 
 Weights = Annotated[
     list[str] | None,
-    typer.Option("--light", metavar="NAME=W", help="Multiply a light of the scene by W, repeatable."),
+    typer.Option("--light", metavar="NAME=W", help="Multiply a light of the scene by W (repeatable)."),
 ]
 SkyImage = Annotated[
     Path | None,
-    typer.Option("--sky", metavar="IMAGE", help="Light a run of --lights sh by this sky: .exr or .hdr, lat-long."),
+    typer.Option(
+        "--sky",
+        metavar="IMAGE",
+        help="Light a run of --lights sh by this image of a sky: .exr or .hdr, latitude-longitude.",
+    ),
 ]
-Turn = Annotated[float, typer.Option("--turn", metavar="DEG", help="Turn the light of a run of --lights sh about up.")]
+Turn = Annotated[
+    float, typer.Option("--turn", metavar="DEG", help="Turn the light of a run of --lights sh about the up axis.")
+]
 
 
 def relit(light: "Illumination", weights: list[str] | None, sky: Path | None, turn: float) -> "Illumination":

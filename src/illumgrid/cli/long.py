@@ -1,4 +1,4 @@
-"""What a long ``illumgrid run`` needs: light that is kept on the way, and many processes or machines."""
+"""For long runs of ``illumgrid run``: finished light that is kept, and many processes or machines."""
 
 import shlex
 import sys
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def loaded(folder: Path) -> "Illumination":
-    """The light of a finished run, or of one on its way, of which it is said how far it is."""
+    """The light of a finished or unfinished run; of an unfinished one, print the finished share."""
     from illumgrid import unfinished
     from illumgrid.chain import load
 
@@ -26,12 +26,14 @@ def loaded(folder: Path) -> "Illumination":
     if place is None:
         return load(folder)
     light, share = unfinished.load(place)
-    say(f"note: {place} is {share:.0%} of a run: between finished nodes the light is coarse, stripes are not lit yet")
+    say(
+        f"note: {place} holds {share:.0%} of a run: the light between finished nodes is coarse, stripes are not lit yet"
+    )
     return light
 
 
 def check_spread(workers: int | None, dask: str | None) -> None:
-    """Refuse what no cluster can be made of, before anything is read."""
+    """Refuse options from which no cluster can be made, before anything is read."""
     from importlib.util import find_spec
 
     if workers is not None and dask is not None:
@@ -59,7 +61,7 @@ def kept(
     finished = resume and store.is_run(folder)
     if not partial.resume(folder if finished else None, overwrite, any_machine):
         if finished:
-            say(f"{folder} holds no moments of its paths; all of them are walked again")
+            say(f"{folder} holds no moments of its paths; all paths are traced again")
         return partial
     done = max((stop for _, stop in (partial.chosen or {})["walked"]), default=0)
     if partial.place.is_dir():
@@ -67,12 +69,12 @@ def kept(
     elif planned or done >= (asked or usual_paths(partial.chosen or {})):
         return None
     else:
-        say(f"going on with the {done} paths of {folder}")
+        say(f"continuing after the {done} paths of {folder}")
     return partial
 
 
 def _write_scene(place: Path, scene: "Scene") -> None:
-    """A folder of a run in which nothing is lit, for pictures of what is."""
+    """Write a folder of a run in which nothing is lit, for pictures of the unfinished run."""
     import numpy as np
 
     from illumgrid.field.scene import level_table
@@ -92,7 +94,7 @@ def _write_scene(place: Path, scene: "Scene") -> None:
 
 
 def shared_out(stages: Mapping[str, Any], workers: int | None) -> dict[str, Any]:
-    """Stages whose backend takes its share of the processors, where several processes work on one machine."""
+    """The stages, with the threads of the backend divided among several processes on one machine."""
     import os
 
     backend = stages["backend"]
@@ -104,7 +106,7 @@ def shared_out(stages: Mapping[str, Any], workers: int | None) -> dict[str, Any]
 
 @contextmanager
 def spread(workers: int | None, dask: str | None, any_machine: bool) -> Iterator[Callable[..., Any]]:
-    """What spreads the work: this process, `workers` processes, or the workers of the scheduler `dask`."""
+    """The map function over this process, `workers` processes, or the workers of the scheduler `dask`."""
     if workers is None and dask is None:
         yield map
         return

@@ -1,4 +1,4 @@
-"""How surfaces look in pictures, as options say it: coats, what is seen through, cuts, colours of a second quantity."""
+"""Options for the look of surfaces in pictures: coats, translucency, cuts, colours of a second quantity."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -18,8 +18,8 @@ Look = Annotated[
     typer.Option(
         "--look",
         metavar="[NAME.]KEY=W",
-        help="Of a field, in pictures only: roughness=0.2 gives it a glossy coat (0 a mirror, 1 dull), translucent=0.6 "
-        "lets 60 % of what lies behind through. Repeatable.",
+        help="Change a field in pictures only: roughness=0.2 adds a glossy coat (0 a mirror, 1 dull), translucent=0.6 "
+        "shows 60 % of what lies behind. Repeatable.",
     ),
 ]
 Clips = Annotated[
@@ -27,27 +27,27 @@ Clips = Annotated[
     typer.Option(
         "--clip",
         metavar="AXIS=PLACE",
-        help="Leave out what lies beyond a plane of the world: x=12.5, or before it: -x=12.5. The cut shows the data "
-        "in grey; the light is that of the whole. Repeatable.",
+        help="Leave out what lies beyond a plane in world coordinates: x=12.5, or before it: -x=12.5. The cut shows "
+        "the data in grey; the light is that of the whole. Repeatable.",
     ),
 ]
 Color = Annotated[
     str | None,
     typer.Option(
         metavar="NAME|FILE",
-        help="Colour surfaces by another field of the run, or by a volume file of the same world, at the brightness of "
-        "white ones.",
+        help="Colour surfaces by another field of the run, or by a volume file in the same world coordinates, with the "
+        "brightness of a white surface.",
     ),
 ]
 ColorMap = Annotated[str, typer.Option("--cmap", metavar="NAME", help="Colormap of matplotlib for --color.")]
 ColorRange = Annotated[
     tuple[float, float] | None,
-    typer.Option(metavar="LO HI", help="Values of --color at the ends of the colormap. [default: all that it has]"),
+    typer.Option(metavar="LO HI", help="Values of --color at the ends of the colormap. [default: all its values]"),
 ]
 
 
 def tint_of(light: "Illumination", color: str | None, cmap: str, ends: tuple[float, float] | None) -> "Tint | None":
-    """The second quantity that options name: a field of the run, or a file."""
+    """The second quantity that the options name: a field of the run, or a file; None without --color."""
     if color is None:
         if cmap != "viridis" or ends is not None:
             option = "--color-range" if ends is not None else "--cmap"
@@ -67,7 +67,7 @@ def tint_of(light: "Illumination", color: str | None, cmap: str, ends: tuple[flo
 
 
 def looking(light: "Illumination", looks: list[str] | None) -> "Illumination":
-    """The light with the looks that options name, by default of the first field."""
+    """The light with the looks that the options set, by default on the first field."""
     given: dict[int, dict[str, float]] = {}
     for text in looks or []:
         place, _, value = text.rpartition("=")
@@ -78,8 +78,8 @@ def looking(light: "Illumination", looks: list[str] | None) -> "Illumination":
             share = -1.0
         if key not in KEYS or not 0 <= share <= 1:
             raise BadInput(
-                f"--look is {text[:60]!r}; expected roughness=W or translucent=W with W from 0 to 1, perhaps after the "
-                "name of a field: film.translucent=0.6"
+                f"--look is {text[:60]!r}; expected roughness=W or translucent=W with W from 0 to 1, optionally after "
+                "the name of a field: film.translucent=0.6"
             )
         given.setdefault(light.scene.number_of(name or None), {})[key] = share
     for number, own in given.items():

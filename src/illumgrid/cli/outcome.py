@@ -1,4 +1,4 @@
-"""What follows when the light of a run is computed: it is saved, judged and reported."""
+"""After the light of a run is computed: save it, measure its error and report."""
 
 import shlex
 import sys
@@ -46,7 +46,7 @@ def finished(
     light: "Illumination", folder: Path, keep: "Partial", stages: dict[str, Any], sentences: list[str],
     preview: bool = True, overwrite: bool = False, source: "Source | None" = None,
 ) -> "Illumination":  # fmt: skip
-    """Save the light of a run in place of what was kept on the way; then measure its error."""
+    """Save the light of a run in place of its DIR.partial; then measure its error."""
     from illumgrid.io import store
 
     return_holes()
@@ -60,7 +60,7 @@ def finished(
 
 
 def judged_light(light: "Illumination", stages: dict[str, Any], folder: Path) -> "Illumination":
-    """With the error that was reached; Ctrl-C ends the judgement, not the finished run."""
+    """The light with the error reached in its recipe; Ctrl-C ends the measurement, not the finished run."""
     from illumgrid.chain import judged
 
     try:
@@ -73,7 +73,7 @@ def judged_light(light: "Illumination", stages: dict[str, Any], folder: Path) ->
 
 
 def _advise(light: "Illumination", stages: dict[str, Any]) -> None:
-    """Where more paths would not help much, say what would."""
+    """If more paths would not reduce the error much, tell which option would."""
     import numpy as np
 
     from illumgrid.accuracy.judge import remedies
@@ -82,27 +82,29 @@ def _advise(light: "Illumination", stages: dict[str, Any]) -> None:
     if (stages["sampler"].name, stages["interpolator"].name) != ("direct", "nearest") or not recipe["reached"]:
         return
     noise = max((e or 0.0 for e in recipe["relative_error"]), default=0.0)
-    if recipe["reached"] < max(0.05, 1.5 * noise) or recipe.get("by_normal"):  # noisy data: said before the run
+    if recipe["reached"] < max(0.05, 1.5 * noise) or recipe.get(
+        "by_normal"
+    ):  # noisy data: the advice came before the run
         return
     specs = [grid.spec for grid in light.grids]
     try:
         found = remedies(light.scene, stages["backend"], specs, recipe["bounces"], recipe["seed"])
-    except Exception as reason:  # a finished run is worth more than advice
+    except Exception as reason:  # failing advice must not fail a finished run
         tell("error", f"what would reduce the error could not be measured ({type(reason).__name__}: {reason})")
         return
     if not found:
         return
-    text = f"interpolation between nodes is off by about {found['now']:.1%} at any number of paths"
+    text = f"the interpolation error between nodes is about {found['now']:.1%} at any number of paths"
     if found["finer"] < 0.8 * found["now"] and not recipe.get("refined"):
-        text += f"; --grid {2 * recipe['grid']} would reduce that to {found['finer']:.1%}"
+        text += f"; --grid {2 * recipe['grid']} would reduce it to {found['finer']:.1%}"
     if found["smooth"] < 0.8 * found["now"]:
-        smooth = np.hypot(recipe.get("smooth", 0.0), 1.0)  # by a voxel more: variances of blurs add up
+        smooth = np.hypot(recipe.get("smooth", 0.0), 1.0)  # one more voxel of blur: variances add up
         text += f"; --smooth {smooth:.2g}, which lights a field without its noise, to {found['smooth']:.1%}"
     tell("grid", text)
 
 
 def again(options: str) -> str:
-    """The command line of this process, with another blur, in place of its result."""
+    """The command line of this process with another blur, which overwrites its result."""
     words = ["illumgrid", *sys.argv[1:]]
     for at in [k for k, word in enumerate(words) if word == "--smooth"][::-1]:
         words[at : at + 2] = []
@@ -111,7 +113,7 @@ def again(options: str) -> str:
 
 
 def report(light: "Illumination", folder: Path, picture: bool) -> None:
-    """Say what was computed, in which time, how far off it is and where it lies."""
+    """Report what was computed, in which time, with which error, and where it is."""
     from illumgrid.bake.known import MOST_BIAS
 
     recipe = light.recipe
@@ -129,9 +131,9 @@ def report(light: "Illumination", folder: Path, picture: bool) -> None:
             + (f", and up to {recipe['grid']} where the light is rough" if refined["levels"] else "")
         )
     if recipe.get("by_normal"):
-        say("nodes are read by level and normal, since the data are noisy; --grid N reads N nodes one by one")
+        say("noisy data: nodes average their neighbours by level and normal (bilateral); --grid N turns that off")
     if recipe.get("cache"):
-        say(f"paths end in light that is known: a bias of at most {MOST_BIAS:.1%} of the mean light on tested scenes")
+        say(f"paths end in a coarse grid: a bias of at most {MOST_BIAS:.1%} of the mean light on tested scenes")
     if recipe["texels"]:
         work += f" and {recipe['texels']} texels of walls x {recipe['texel_paths']} paths"
     say(f"{work} in {sum(recipe['seconds'].values()):.1f} s{noise}{omitted_light(recipe)}")

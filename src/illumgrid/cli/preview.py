@@ -27,25 +27,25 @@ FULL_PATHS = 256
 CONFLICTS = {
     "--sweep": {"--isovalue": "a sweep shows the whole range", "--isovalues": "a sweep shows the whole range"},
     "--isovalues": {
-        "--isovalue": "one names all isovalues", "--split": "a strip has one light",
+        "--isovalue": "--isovalues names all of them", "--split": "a strip shows one kind of light",
         "--trust": "a strip has no room for the scale of error bars",
     },
     "--grid-volume": dict.fromkeys(
         ("--sweep", "--isovalue", "--isovalues", "--local", "--trust", "--split", "--scale-bar"),
-        "the grid has no isovalue and one light",
+        "the grid has no isovalue and only its own light",
     ),
     "--trust": {"--local": "error bars are those of global light", "--split": "error bars are those of global light",
-                "--exposure": "error bars are not light"},
+                "--exposure": "exposure does not change error bars"},
     "--split": {"--local": "--split shows local light on the left"},
     "--exact": {
         "--local": "a lamp at the camera needs no rays", "--trust": "error bars are those of lookups",
-        "--grid-volume": "the grid is what it is", "--engine": "rays are traced in software",
+        "--grid-volume": "the grid is drawn as it is stored", "--engine": "rays are traced in software",
     },
     "--watch": {"--sweep": "a film is written once", "--isovalues": "a strip is written once",
                 "--split": "two pictures are written once"},
     "--clip": {"--grid-volume": "the grid has a cut of its own, --cut"},
     "--color": {"--grid-volume": "the grid shows its own light", "--trust": "error bars have their own colours"},
-    "--camera": dict.fromkeys(("--view", "--zoom", "--up", "--roll"), "the camera of the picture says all of that"),
+    "--camera": dict.fromkeys(("--view", "--zoom", "--up", "--roll"), "the camera of the picture sets all of these"),
 }  # fmt: skip
 """Options that exclude each other, and the reason."""
 
@@ -71,9 +71,11 @@ def preview(
         str | None,
         typer.Option(metavar="C,C,...", help="Several isovalues side by side in one picture, seen by one camera."),
     ] = None,
-    local: Annotated[bool, typer.Option("--local", help="A lamp at the camera instead of the computed light.")] = False,
+    local: Annotated[
+        bool, typer.Option("--local", help="Light by a lamp at the camera instead of the computed light.")
+    ] = False,
     trust: Annotated[
-        bool, typer.Option("--trust", help="Relative error bars instead of light, with holes hatched.")
+        bool, typer.Option("--trust", help="Show relative error bars instead of light; holes are hatched.")
     ] = False,
     split: Annotated[bool, typer.Option("--split", help="Local light left, global light right.")] = False,
     exposure: Annotated[
@@ -83,19 +85,19 @@ def preview(
         bool, typer.Option("--grid-volume", help="The illumination grid itself, as a block.")
     ] = False,
     cut: Annotated[
-        bool, typer.Option("--cut", help="With --grid-volume: cut out the corner nearest to the eye.")
+        bool, typer.Option("--cut", help="With --grid-volume: cut out the corner nearest to the viewer.")
     ] = False,
     exact: Annotated[
         str | None,
         typer.Option(
             metavar="N|full[:N]",
-            help="Gather light by N rays from every pixel, each ending in the grid after a reflection: sharp shadows. "
-            "full: paths of every length and no grid, the reference, 256 of them by default.",
+            help="Gather light by N rays from every pixel, which end in the stored light: sharp shadows. full or "
+            "full:N: N paths of every length, without the grid, as a reference. [default of N: 256]",
         ),
     ] = None,
     watch: Annotated[
         bool,
-        typer.Option("--watch", help="With --exact: write the picture after 4 rays, after 16, 64... too."),
+        typer.Option("--watch", help="With --exact: write the picture also after 4, 16, 64... rays."),
     ] = False,
     view: Annotated[
         str | None,
@@ -117,7 +119,7 @@ def preview(
         tuple[int, int], typer.Option(metavar="W H", help="Pixels of the picture, or of each panel.")
     ] = SIZE,
     scale_bar: Annotated[
-        bool, typer.Option("--scale-bar", help="A bar of known length, at the depth of the middle of the object.")
+        bool, typer.Option("--scale-bar", help="A bar of known length, valid at the depth of the middle of the object.")
     ] = False,
     background: Annotated[
         str | None,
@@ -230,12 +232,12 @@ def _check(
 
 
 def _exact(text: str) -> "Exact":
-    """What --exact says: a number of rays, or `full` paths and perhaps their number."""
+    """Parse --exact: a number of rays, or `full` with an optional number of paths."""
     from illumgrid.show.exact import Exact
 
     first, _, number = text.rpartition(":") if text != "full" else ("full", "", str(FULL_PATHS))
     if first not in ("", "full") or not (number.isascii() and number.isdigit() and len(number) < 9):
-        raise BadInput(f"--exact is {text[:60]!r}; expected a number of rays a pixel, full, or full:256")
+        raise BadInput(f"--exact is {text[:60]!r}; expected a number of rays per pixel, full, or full:256")
     return Exact(int(number), first == "full")
 
 
@@ -268,7 +270,7 @@ def _say_doubts(light: "Illumination") -> None:
 
 
 def _camera_in(file: Path) -> "Camera":
-    """The camera that a picture was taken by, from its text."""
+    """The camera of a picture, from the text of its PNG."""
     from PIL import Image, UnidentifiedImageError
 
     from illumgrid.show.camera import camera_of
@@ -284,7 +286,7 @@ def _camera_in(file: Path) -> "Camera":
 
 
 def _about(camera: "Camera | None") -> dict[str, str]:
-    """What the text of a PNG says: the command, and the camera."""
+    """The text of a PNG: the command, and the camera."""
     from illumgrid.show.camera import camera_text
 
     about = {"Command": shlex.join(["illumgrid", *sys.argv[1:]])}
@@ -320,7 +322,7 @@ def _fitted(
 def _drawn(
     light: "Illumination", field: str | None, local: bool, split: bool, options: dict[str, Any]
 ) -> Callable[[float | None], Any]:
-    """What draws an isovalue: one picture, or two side by side."""
+    """A function that draws an isovalue: one picture, or two side by side."""
     import numpy as np
 
     from illumgrid.show import render

@@ -24,14 +24,23 @@ OPTIONS: dict[str, Any] = {
     ],
     "label": Annotated[
         str | None,
-        typer.Option("--label", metavar="N[,N…]", help="The file is a label map: smooth surfaces of these labels."),
+        typer.Option(
+            "--label", metavar="N[,N…]", help="The file is a label map: light smooth surfaces of these labels."
+        ),
     ],
     "crop": Annotated[
         tuple[int, int, int, int, int, int] | None,
-        typer.Option("--crop", metavar="A B C D E F", help="Only voxels A to B - 1 along x, C to D - 1, E to F - 1."),
+        typer.Option(
+            "--crop",
+            metavar="A B C D E F",
+            help="Only voxels A to B - 1 along x, C to D - 1 along y, E to F - 1 along z.",
+        ),
     ],
     "downsample": Annotated[
-        int | None, typer.Option("--downsample", min=1, metavar="N", help="Means over blocks of N x N x N voxels.")
+        int | None,
+        typer.Option(
+            "--downsample", min=1, metavar="N", help="Reduce the volume to means over blocks of N x N x N voxels."
+        ),
     ],
     "follow": Annotated[
         bool, typer.Option("--follow", help="Read data files outside the folder of the header that names them.")
@@ -44,7 +53,7 @@ NONE: dict[str, Any] = {}
 
 
 def with_reading(command: Callable[..., None]) -> Callable[..., None]:
-    """The same command with these options in place of its parameter `reading`, which gets those that were given."""
+    """Replace the parameter `reading` of a command by these options; it receives those that were given."""
 
     @wraps(command)
     def with_options(**options: Any) -> None:
@@ -71,16 +80,16 @@ def labels_of(text: str | None) -> tuple[int, ...]:
         return ()
     words = text.replace(",", " ").split()
     if not words or not all(word.removeprefix("-").isdecimal() for word in words) or len(set(words)) < len(words):
-        raise BadInput(f"--label is {text!r}; expected labels that differ, whole numbers, such as 3 or 1,3")
+        raise BadInput(f"--label is {text!r}; expected different whole numbers, such as 3 or 1,3")
     return tuple(map(int, words))
 
 
 def check_inside(inside: str | None, label: str | None) -> None:
-    """Refuse a side that is none, and one beside a label, whose field is positive inside the label."""
+    """Refuse an unknown side, and any side together with a label, whose field is positive inside the label."""
     if inside not in (None, "above", "below"):
         raise BadInput(f"--inside is {inside!r}; expected above or below")
     if inside is not None and label is not None:
-        raise BadInput("--inside and --label came together; expected one of them: solid is what has the label")
+        raise BadInput("--inside and --label came together; expected one of them: the inside of a label is solid")
 
 
 def given(**options: Any) -> dict[str, Any]:

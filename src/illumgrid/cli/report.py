@@ -1,4 +1,4 @@
-"""What `illumgrid bench` found, as records, files and text: which setting to use."""
+"""The result of `illumgrid bench` as records, files and text, with recommended settings."""
 
 import csv
 import io
@@ -32,7 +32,7 @@ REMEDIES = {
 
 
 def described(report: Report, name: str, scene: Scene) -> Record:
-    """All of a report, as JSON has it."""
+    """The whole report in types of JSON."""
     best = set(map(id, report.front))
     records = [record(p, report.references, id(p) in best) for p in report.points]
     parts = [{"nodes": m.grid, "paths": m.paths, **asdict(m.parts), "total": m.parts.total} for m in report.parts]
@@ -62,7 +62,7 @@ def described(report: Report, name: str, scene: Scene) -> Record:
 
 
 def record(point: Point, references: dict[str, Reference], on_front: bool) -> Record:
-    """A point of the chart as JSON and CSV have it; shares are of the mean light."""
+    """A point of the chart as a row of JSON and CSV; errors are relative to the mean light."""
     method, filler = point.method, point.interpolator
     stages = {"sampler": method.sampler, "backend": method.backend, "interpolator": filler}
     each = [errors(light, references[method.surface]) for light in point.light]
@@ -93,7 +93,7 @@ def record(point: Point, references: dict[str, Reference], on_front: bool) -> Re
 
 def options(record: Record, bounces: int) -> str:
     """A setting as options of ``illumgrid run``."""
-    if record["looked"]:  # and as many bounces as it takes
+    if record["looked"]:  # it chooses the number of bounces by itself
         return f"--backend {record['backend']} --paths {record['paths']}"
     words = [f"--{kind} {record[kind]}" for kind in ("sampler", "backend", "interpolator")]
     if count := record["options"]["sampler"].get("count"):
@@ -130,16 +130,16 @@ def cost(record: Record) -> str:
 
 
 def standing(default: Record, best: Sequence[Record], bounces: int) -> str:
-    """Where `run`'s default stands against the front (from fast to accurate)."""
+    """The position of `run`'s default relative to the Pareto front (sorted from fast to accurate)."""
     own = f"run's default ({cost(default)})"
     if default["front"]:
         return f"{own} is on the front"
     better = min((r for r in best if r["seconds"] <= default["seconds"]), key=lambda r: r["rmse"])
-    return f"{own} is beaten by {options(better, bounces)} ({cost(better)})"
+    return f"{own} is dominated by {options(better, bounces)} ({cost(better)})"
 
 
 def dominant(record: Record, parts: Sequence[Record]) -> str:
-    """The largest part of the error at a setting, and what lessens it."""
+    """The largest part of the error at a setting, and how to reduce it."""
     near = min(
         parts, key=lambda p: (abs(np.log(p["nodes"] / record["grid"])), abs(np.log(p["paths"] / record["paths"])))
     )
@@ -174,7 +174,7 @@ def _csv(records: Sequence[Record]) -> bytes:
 
 
 def table(records: Sequence[Record]) -> str:
-    """The front, what `run` does by default, and the best of every other contestant, as text."""
+    """The Pareto front, the default of `run`, and the best point of every other contestant, as text."""
     best = sorted((r for r in records if r["front"]), key=lambda r: r["seconds"])
     default = [r for r in records if r["default"] and not r["front"]]
     seen, others = {r["contestant"] for r in best}, []

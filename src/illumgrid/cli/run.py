@@ -56,18 +56,19 @@ def run(
         ),
     ] = None,
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", metavar="DIR", help="Where the result goes. [default: INPUT-light]")
+        Path | None, typer.Option("--output", "-o", metavar="DIR", help="Folder for the result. [default: INPUT-light]")
     ] = None,
     sampler: Annotated[str, typer.Option(help="Where to ask for light: direct, uniform, adaptive.")] = "direct",
     isovalues: Annotated[
-        int | None, typer.Option(min=2, metavar="K", help="Rows of the level table; sampler.count too. [default: 32]")
+        int | None,
+        typer.Option(min=2, metavar="K", help="Rows of the level table; sets sampler.count, too. [default: 32]"),
     ] = None,
     limits: Annotated[
         tuple[float, float] | None,
         typer.Option("--range", metavar="LO HI", help="Isovalues to sweep. [default: from the data, as info suggests]"),
     ] = None,
     inside: Annotated[
-        str | None, typer.Option(help="Which side of the isovalue is solid: above, below. [default: above]")
+        str | None, typer.Option(help="Which side of the isosurface is solid: above or below. [default: above]")
     ] = None,
     signed: Annotated[
         bool, typer.Option("--signed", help="Light h >= c and h <= -c, in two colours; --range is that of c, above 0.")
@@ -76,7 +77,7 @@ def run(
     paths: Annotated[
         int | None,
         typer.Option(
-            min=1, metavar="N", help="Paths from every query. [default: 32; sky alone: 8 to 64; noisy data: 16]"
+            min=1, metavar="N", help="Paths per query. [default: 32; under a sky alone 8 to 64; for noisy data 16]"
         ),
     ] = None,
     bounces: Annotated[
@@ -84,12 +85,12 @@ def run(
         typer.Option(
             min=0,
             metavar="N",
-            help="Reflections. [default: until under 1 % is left out, at least 8]",
+            help="Reflections per path. [default: until less than 1 % of the light is left out, at least 8]",
         ),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, max=2**64 - 1, metavar="N", help="Equal seeds give equal light.")] = 0,
     interpolator: Annotated[
-        str, typer.Option(help="nearest, bilateral, splat or rbf. Noisy data in the studio: bilateral.")
+        str, typer.Option(help="nearest, bilateral, splat or rbf. For noisy data in the studio: bilateral.")
     ] = "nearest",
     grid: Annotated[
         int | None,
@@ -97,7 +98,9 @@ def run(
     ] = None,
     surroundings: Annotated[
         str | None,
-        typer.Option("--scene", help="What is around a volume: studio, sky, floor, box (and lamp). [default: studio]"),
+        typer.Option(
+            "--scene", help="Surroundings of a volume: studio, sky, floor, box (with a lamp). [default: studio]"
+        ),
     ] = None,
     texels: Annotated[
         int | None,
@@ -105,23 +108,29 @@ def run(
             min=1,
             max=4096,
             metavar="N",
-            help="Texels along the longest edge of the walls. [default: those of the scene: one for three voxels]",
+            help="Texels along the longest edge of the walls. [default: of the scene, about one for three voxels]",
         ),
     ] = None,
     albedo: Annotated[
         tuple[float, float, float] | None,
-        typer.Option(metavar="R G B", help="Share of light that the surface reflects. [default: a neutral grey]"),
+        typer.Option(
+            metavar="R G B", help="Fraction of the light that the surface reflects. [default: a neutral grey]"
+        ),
     ] = None,
     lights: Annotated[
         str | None,
-        typer.Option(help="sh: keep the answer to spherical harmonics of distant light, for preview --sky and --turn."),
+        typer.Option(
+            help="sh: store the light of a basis of skies, spherical harmonics, for preview --sky and --turn."
+        ),
     ] = None,
     degree: Annotated[
-        int | None, typer.Option(min=0, max=4, metavar="L", help="Of those harmonics: (L + 1)² layers. [default: 2]")
+        int | None,
+        typer.Option(min=0, max=4, metavar="L", help="Degree of these harmonics: (L + 1)² layers. [default: 2]"),
     ] = None,
     reading: dict[str, Any] = NONE,
     settings: Annotated[
-        list[str] | None, typer.Option("--set", metavar="STAGE.OPTION=VALUE", help="Any option of a stage, repeatable.")
+        list[str] | None,
+        typer.Option("--set", metavar="STAGE.OPTION=VALUE", help="Set an option of a stage (repeatable)."),
     ] = None,
     error: Annotated[
         float | None,
@@ -129,7 +138,7 @@ def run(
     ] = None,
     seconds: Annotated[
         float | None,
-        typer.Option(metavar="S", help="Choose them for this much computing time. Reading and writing come on top."),
+        typer.Option(metavar="S", help="Choose them for this computing time; reading and writing are not counted."),
     ] = None,
     smooth: Annotated[
         float | None, typer.Option(min=0.0, metavar="SIGMA", help="Gaussian blur in voxels before anything else.")
@@ -137,31 +146,32 @@ def run(
     threads: Annotated[
         int | None, typer.Option(min=1, metavar="N", help="Threads. [default: one per processor]")
     ] = None,
-    no_preview: Annotated[bool, typer.Option("--no-preview", help="Leave the picture out.")] = False,
+    no_preview: Annotated[bool, typer.Option("--no-preview", help="Draw no picture.")] = False,
     no_embed: Annotated[
-        bool, typer.Option("--no-embed", help="Refer to the volume file, which must stay, in place of a copy in DIR.")
+        bool, typer.Option("--no-embed", help="Store a reference to the volume file, which must stay, and no copy.")
     ] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a finished run in DIR.")] = False,
     resume: Annotated[
         bool,
-        typer.Option("--resume", help="Go on: with what a stopped run left, or with more --paths on a finished DIR."),
+        typer.Option("--resume", help="Continue a stopped run, or add paths, up to --paths, to a finished one."),
     ] = False,
     workers: Annotated[
-        int | None, typer.Option(min=1, metavar="N", help="So many processes on this machine, by dask.distributed.")
+        int | None, typer.Option(min=1, metavar="N", help="Use N processes on this machine, by dask.distributed.")
     ] = None,
     dask: Annotated[
-        str | None, typer.Option(metavar="ADDRESS", help="The workers of a dask scheduler, such as tcp://host:8786.")
+        str | None,
+        typer.Option(metavar="ADDRESS", help="Use the workers of a dask scheduler, such as tcp://host:8786."),
     ] = None,
     lazy: Annotated[
         bool,
-        typer.Option("--lazy", help="Open a page with coarse light at once; light what one looks at, as one looks."),
+        typer.Option("--lazy", help="Open a page with coarse light at once, and light first what is in view."),
     ] = False,
     any_machine: Annotated[
         bool,
         typer.Option(
             "--any-machine",
-            help="Accept another processor or other versions, among workers or since a run was stopped: the same light "
-            "then, but for its last digits.",
+            help="Accept workers, or a stopped run, with another processor or other versions of packages; the light "
+            "may then differ in its last digits.",
         ),
     ] = False,
     ignore: Ignore = None,
@@ -169,7 +179,7 @@ def run(
     """Light a volume, the volumes of a scene file, or a built-in scene, for all isovalues at once.
 
     DIR then holds illumination.exr, run.json and preview.png, and needs nothing else (--no-embed: the volume file).
-    A long run keeps what it has finished in DIR.partial: after a stop the same command goes on from there.
+    A long run keeps its finished light in DIR.partial: after a stop, the same command continues from there.
     """
     from illumgrid.chain import run as light_up
     from illumgrid.cli.lazily import look
@@ -189,7 +199,7 @@ def run(
         asked = scene_input(source, surroundings, limits, inside, signed, albedo, reading)
         if no_embed and asked.source is None:
             raise BadInput(
-                f"--no-embed came with the scene {asked.name!r}; expected a volume file with it; leave it out"
+                f"--no-embed came with the scene {asked.name!r}; expected a volume file with it; leave the option out"
             )
         if asked.preset and error is None and seconds is None:
             grid, paths = grid or asked.preset.grid, paths or asked.preset.paths
@@ -208,7 +218,7 @@ def run(
         }
         keep = kept(folder, scene, stages, resume, overwrite, any_machine, error=error, seconds=seconds, **numbers)
         if keep is None:
-            say(f"{folder} is finished, and holds as many paths: nothing is left to do")
+            say(f"{folder} is finished and has that many paths: nothing is left to do")
             return
         about = {"input": asked.name if source is None else source, "reading": reading, "smooth": smooth or 0.0}
         if lazy:
@@ -222,7 +232,7 @@ def run(
             for finding in diagnose(field, nodes_over(field.volume, grid), smooth or 0.0):
                 tell(finding.name, finding.sentence)
                 if finding.name == "noise" and "noise" not in (ignore or []):
-                    say(f"  smoothed that far: {again(finding.options)}")
+                    say(f"  the command with this blur: {again(finding.options)}")
         if backend == "auto":
             say(_why_auto())
         return_holes()
@@ -238,7 +248,7 @@ def run(
 
 
 def _why_auto() -> str:
-    """Which backend `auto` took, and why."""
+    """The sentence that states which backend `auto` selected, and why."""
     from illumgrid import registry
 
     return f"backend: {registry.auto_backend()} ({registry.WHY_AUTO})"

@@ -1,4 +1,4 @@
-"""What a command is to light: a volume with what is around it, a scene file or a built-in scene."""
+"""The input of a command: a volume with its surroundings, a scene file or a built-in scene."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -22,9 +22,9 @@ AROUND = ("studio", "sky", "floor", "box")
 
 @dataclass(frozen=True)
 class Input:
-    """What is to be lit: a name for the folder of the result, and how the scene is made, blurred by `smooth` voxels.
+    """The input of a command: a name for the folder of the result, and a function `make(smooth)` that makes the scene.
 
-    `source` is the volume file of such a scene, where it is one.
+    `smooth` is a blur in voxels. `source` is the volume file of the scene, if it has one.
     """
 
     name: str
@@ -42,7 +42,7 @@ def scene_input(
     albedo: tuple[float, float, float] | None,
     reading: dict[str, Any],
 ) -> Input:
-    """Tell a volume file from a scene file and a built-in scene; nothing is read yet."""
+    """Recognise a volume file, a scene file or a built-in scene; nothing is read yet."""
     from illumgrid.field.builtin import SCENES
     from illumgrid.io.readers import volume_name
 
@@ -84,7 +84,7 @@ def _scene_file(name: str) -> Input:
 def _volume_scene(
     read_as: "Callable[[float], Source]", surroundings: str, albedo: Any, limits: Any, smooth: float
 ) -> "Scene":
-    """The fields of a volume with what is around them; both signs of it if its side is None."""
+    """The fields of a volume with their surroundings; both signs of it if its side is None."""
     import numpy as np
 
     from illumgrid.field.labels import fields_of
@@ -105,7 +105,7 @@ def _volume_scene(
 
 
 def _around_all(around: Callable[..., "Scene"], fields: "Sequence[Field]") -> "Scene":
-    """Several fields of one lattice with what `around` puts around the first."""
+    """Several fields of one lattice with the surroundings that `around` makes for the first."""
     first = fields[0]
     scene = around(first.volume, first.material.albedo, first.range, first.inside, first.name)
     return replace(scene, fields=tuple(fields))

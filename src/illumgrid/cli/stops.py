@@ -1,7 +1,7 @@
-"""Ctrl-C, SIGTERM and SIGHUP end a command at once, also inside a library that does not look for signals.
+"""Ctrl-C, SIGTERM and SIGHUP end a command at once, also inside a library that does not check for signals.
 
-Python raises KeyboardInterrupt when the main thread is back in Python. A filter or a search tree of a large array is
-one call that takes many seconds; a thread ends the process then, and removes what it has begun to write.
+Python raises KeyboardInterrupt only when the main thread is back in Python. A filter or a search tree on a large array
+is one call that takes many seconds; in this case a thread removes the unfinished files and ends the process.
 """
 
 import os
@@ -73,13 +73,13 @@ def listen(numbers: Sequence[int]) -> None:
 
 
 def answered() -> None:
-    """Say that a command knows of its stop; else it comes again: libraries drop exceptions that they do not expect."""
+    """Mark a stop as handled. Otherwise it is repeated, since libraries may drop exceptions that they do not expect."""
     unanswered[0] = 0
 
 
 @contextmanager
 def ends_normally() -> Iterator[None]:
-    """A stop within this is the normal end of a command, such as that of a server: exit 0, and nothing to say."""
+    """Within this, a stop is the normal end of a command, such as a server: exit code 0 and no message."""
     _normal[0] = True
     try:
         with suppress(KeyboardInterrupt):
@@ -101,6 +101,6 @@ def _end() -> None:
 
 
 def sentence() -> str:
-    """What a stopped command leaves."""
+    """The message about what a stopped command leaves."""
     done = [f"{place} is written and complete" for place in disk.written if not place.name.endswith(".partial")]
     return f"illumgrid: stopped; {next(iter([*disk.kept, *done]), 'nothing was written')}"

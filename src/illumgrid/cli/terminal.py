@@ -15,7 +15,7 @@ from illumgrid.errors import WARNINGS, BadInput, IllumgridWarning
 if TYPE_CHECKING:
     from illumgrid.bake.accumulator import Progress
 
-INTERVAL = 10.0  # seconds between two lines of progress where there is no terminal to draw a bar on
+INTERVAL = 10.0  # seconds between two lines of progress without a terminal
 
 
 def say(text: str) -> None:
@@ -29,7 +29,7 @@ def result(text: str) -> None:
 
 
 def harmless(text: str) -> str:
-    """Text whose control characters are written out: what a file says must not command the terminal."""
+    """Text with escaped control characters, so that the content of a file cannot control the terminal."""
     return "".join(c if c in "\n\t" or unicodedata.category(c) not in ("Cc", "Cf") else ascii(c)[1:-1] for c in text)
 
 
@@ -60,7 +60,7 @@ def reported_warnings(ignored: Sequence[str] | None = None) -> Iterator[list[str
 
 
 def say_what_compiles() -> None:
-    """Say when compilation begins, and every `INTERVAL` seconds how far it is."""
+    """Report when compilation begins, and every `INTERVAL` seconds what is compiled."""
     begun: list[float] = []
 
     def note(record: logging.LogRecord) -> bool:
@@ -82,7 +82,7 @@ def say_what_compiles() -> None:
 def progress_bars(about: Callable[[], str] = lambda: "") -> Iterator["Progress"]:
     """Progress of long work: a bar with the time left on a terminal, elsewhere a line every `INTERVAL` seconds.
 
-    What `about` says at the time is added.
+    The current text of `about` is added.
     """
     from rich.console import Console
 
@@ -125,7 +125,7 @@ def _progress_lines(about: Callable[[], str]) -> "Progress":
 
 
 def _duration(seconds: float) -> str:
-    """A time in words, about."""
+    """An approximate time in words."""
     for unit, size in (("h", 3600), ("min", 60)):
         if seconds >= 2 * size:
             return f"about {seconds / size:.0f} {unit}"

@@ -19,7 +19,7 @@ def view(
         Path,
         typer.Argument(
             metavar="DIR|INPUT",
-            help="A run, finished or not; or what run takes, to be lit in INPUT-light while one looks.",
+            help="A run, finished or not; or an input of run, which is lit in INPUT-light while you look.",
         ),
     ],
     export: Annotated[
@@ -28,7 +28,7 @@ def view(
     no_open: Annotated[bool, typer.Option("--no-open", help="Print the address of the page; open no browser.")] = False,
     desktop: Annotated[
         bool,
-        typer.Option("--desktop", help="A PyVista window instead of a page; extracts every isosurface that it shows."),
+        typer.Option("--desktop", help="Open a PyVista window instead of a page; it extracts each isosurface."),
     ] = False,
     weights: Weights = None,
     sky: SkyImage = None,
@@ -68,7 +68,7 @@ def view(
         light = looking(relit(loaded(folder), weights, sky, turn), look)
         tint = tint_of(light, color, cmap, color_range)
     if desktop and (tint is not None or look):
-        raise BadInput("--desktop came with --look or --color; expected it without them: its window shows light alone")
+        raise BadInput("--desktop came with --look or --color; expected it without them: its window shows only light")
     if desktop:
         from illumgrid.show.viewer.desktop import show
 

@@ -1,9 +1,9 @@
-"""Boundaries between the classes that the data hold (air, skin, bone), and the range of isovalues that contains them.
+"""Boundaries between the classes in the data (air, skin, bone), and the range of isovalues that contains them.
 
 At a boundary the slope is greatest across it: there the second derivative along the gradient vanishes (G. Kindlmann and
 J. Durkin, "Semi-automatic generation of transfer functions for direct volume rendering", VolVis 1998; J. Canny, "A
-computational approach to edge detection", PAMI 8(6), 1986). The values at such voxels say which isovalues people look
-for: those whose surfaces are steep.
+computational approach to edge detection", PAMI 8(6), 1986). The values at such voxels are the isovalues of
+interest: those whose surfaces are steep.
 """
 
 from collections.abc import Callable
@@ -18,13 +18,13 @@ from illumgrid.errors import BadInput, shown
 from illumgrid.field.filters import finite
 from illumgrid.field.volume import UPWARD, Floats, Side, Volume, histogram, slabs
 
-_VOXELS = 1 << 22  # that are looked at, in slabs spread over the volume
+_VOXELS = 1 << 22  # voxels of a large volume that are examined, in slabs spread over it
 _SLAB, _MARGIN = 16, 4  # slices of a slab, and of what the blur needs around it
-_SLABBED, _CUBE = 1 << 24, 48  # voxels beyond which cubes of this side are looked at
-_BLUR = 1.0  # voxels, against noise
-_FLAT = 0.003  # of the steepest slope: what is flatter is not looked at
-_STEEP = 0.05, 0.15  # of the slope of the steep boundaries: what is flatter is noise, without and with a background
-_NOISE = 4.0  # over the slopes of four fifths of the background: what is steeper is no noise
+_SLABBED, _CUBE = 1 << 24, 48  # voxels beyond which cubes of this side are examined
+_BLUR = 1.0  # voxels: a blur against noise
+_FLAT = 0.003  # of the steepest slope: flatter voxels are not examined
+_STEEP = 0.05, 0.15  # of the slope of the steep boundaries: flatter ones are noise, without and with a background
+_NOISE = 4.0  # over the slopes of four fifths of the background: steeper voxels are not noise
 _RIDGE = 1e-3  # by which a slope exceeds those a voxel ahead and behind, relative
 _FEWEST = 64  # boundary voxels from which a range is taken
 _OUTER, _INNER = 0.02, 0.8  # shares of the boundaries above which a range begins, and of their slopes, where it ends
@@ -66,7 +66,7 @@ def suggest_range(volume: Volume, inside: Side = "above") -> tuple[float, float,
 
 
 def suggest_magnitudes(volume: Volume) -> tuple[float, float, str]:
-    """Suggest a range of c for the surfaces at +c and -c: what `suggest_range` says of the absolute value of h."""
+    """Suggest a range of c for the surfaces at +c and -c: `suggest_range` of the absolute value of h."""
     return _suggest(_parts(volume, np.abs), "above")
 
 
@@ -84,7 +84,7 @@ def has_both_signs(volume: Volume) -> bool:
 
 
 def _parts(volume: Volume, part: Callable[[Floats], Floats]) -> Volume:
-    """The volume with a function of h, 0 where h is not finite."""
+    """The volume with a function applied to h, 0 where h is not finite."""
     values = np.empty(volume.shape, np.float32 if volume.plain else np.float64)
     for slab in slabs(volume.shape):
         h = volume.in_units(volume.stored[slab].astype(values.dtype))
@@ -97,7 +97,7 @@ def _on_one_side(volume: Volume, inside: Side) -> tuple[float, float, str]:
     sign = UPWARD[inside]
     reach = max(sign * x for x in volume.extremes)
     low, high, why = suggest_magnitudes(volume)
-    if high > reach:  # the other side reaches farther
+    if high > reach:  # the other side extends farther
         low, high, why = _suggest(_parts(volume, lambda h: np.maximum(sign * h, 0)), "above")
     low, high = sorted((sign * low, sign * high))
     side = "positive" if sign > 0 else "negative"
@@ -137,7 +137,7 @@ def _suggest(volume: Volume, inside: Side) -> tuple[float, float, str]:
 def _out_of_haze(
     volume: Volume, inside: Side, value: Floats, slope: Floats, ends: tuple[float, float]
 ) -> tuple[float, float]:
-    """The range, or one that begins where the solid leaves the border, if at the middle it still fills much of it.
+    """The range; if the solid at its middle fills much of the border, a range that begins where it leaves it.
 
     A field of one class that thins out in all directions, as density does around a cluster of galaxies, has most of its
     boundaries in the haze, which the border cuts; what people look for are the bodies within. Fields of several classes
@@ -183,7 +183,7 @@ def _varying(volume: Volume, inside: Side) -> Volume:
 
 
 def _in_units(volume: Volume, inside: Side, depth: Floats | list[float]) -> list[float]:
-    """Isovalues at shares of the span of the data, which count inward."""
+    """Isovalues at shares of the span of the data, counted inward."""
     low, high = (float(x) for x in volume.stored_extremes)
     share = np.asarray(depth) if UPWARD[inside] > 0 else 1 - np.asarray(depth)
     return [float(x) for x in np.asarray(volume.in_units(low + share * (high - low)))]
@@ -203,7 +203,7 @@ def _parts_of(shape: tuple[int, int, int]) -> list[tuple[slice, ...]]:
 
 
 def _blurred(volume: Volume, inside: Side) -> list[tuple[NDArray[np.float32], tuple[slice, ...]]]:
-    """Blurred parts of a volume, their values from 0 outside to 1 inside, and the slices that count."""
+    """Blurred parts of a volume with values from 0 outside to 1 inside, and the slices to be counted."""
     from scipy.ndimage import gaussian_filter
 
     v = volume.stored
@@ -219,7 +219,7 @@ def _blurred(volume: Volume, inside: Side) -> list[tuple[NDArray[np.float32], tu
 
 
 def _boundary_voxels(volume: Volume, inside: Side) -> tuple[Floats, Floats]:
-    """Values, as shares of the span, and slopes (n,) of voxels steeper than those before and behind, and than noise."""
+    """Values, as shares of the span, and slopes (n,) of voxels steeper than their neighbours and than noise."""
     from scipy.ndimage import map_coordinates
 
     counts, depth = _histogram(volume, inside)
@@ -239,7 +239,7 @@ def _boundary_voxels(volume: Volume, inside: Side) -> tuple[Floats, Floats]:
         along = gradient.reshape(3, -1).take(flat, axis=1) / step[:, None]
         along /= reduce(np.maximum, np.abs(along))
         ridge = np.arange(len(flat))
-        for way in (1, -1):  # what is not steeper than the voxel ahead is not asked for the one behind
+        for way in (1, -1):  # only voxels steeper than the one ahead are compared with the one behind
             at = index.take(ridge, axis=1) + way * along.take(ridge, axis=1)
             ridge = ridge[own[ridge] > (1 + _RIDGE) * map_coordinates(length, at, order=1, mode="nearest")]
         value.append(part.ravel()[flat[ridge]])
@@ -256,7 +256,7 @@ def _boundary_voxels(volume: Volume, inside: Side) -> tuple[Floats, Floats]:
 
 
 def _density(value: Floats) -> Floats:
-    """Of the boundaries' values in `_BINS` bins of the span; the greatest is 1."""
+    """Density of the boundaries' values in `_BINS` bins of the span; the greatest is 1."""
     from scipy.ndimage import gaussian_filter1d
 
     counts, _ = np.histogram(value, _BINS, (0, 1))
@@ -290,7 +290,7 @@ def _peaks(density: Floats) -> list[float]:
         top, before, after = height[k], height[: k + 1][::-1], height[k:]
         if top < max(0.1, height[k - 1], height[k + 1]):
             continue
-        # How deep one goes down on the way to what is higher, or to the end.
+        # How far the density falls on the way to a higher value, or to the end.
         valleys = [side[: np.argmax(side > top) or len(side)].min() for side in (before, after)]
         if top - max(valleys) >= max(0.1, np.nextafter(0.5 * top, 1.0)):
             found.append((int(begins[k] + ends[k]) // 2 - 0.5) / _BINS)

@@ -1,8 +1,8 @@
-"""Where a field is empty, at every isovalue: what lets a ray leap.
+"""Where a field is empty at any isovalue, so that rays can skip that space.
 
-A field is turned: its solid is {sign v >= level}. Its values become ranks of one byte, and its cells are grouped into
-bricks of BRICK³. What can be skipped at one level is then found by comparing bytes: there is nothing to build for a new
-one.
+The sign of a field is chosen so that its solid is {sign v >= level}. Its values become ranks of one byte, and its cells
+are grouped into bricks of BRICK³. Comparing bytes then shows what can be skipped at a level: nothing has to be built
+for a new one.
 """
 
 from typing import Any, NamedTuple
@@ -26,22 +26,22 @@ Bytes = NDArray[np.uint8]
 class Bricks(NamedTuple):
     """The ranks of one field.
 
-    rank(x) is the number of `steps` that are not above x. It never falls as x grows, so that what ranks below a level
-    is below it; the converse may fail, and then a cell is looked at in vain.
+    rank(x) is the number of `steps` that are not above x. It never falls as x grows, so a value whose rank is below
+    that of a level is below the level. The converse may fail; a cell is then tested without a hit.
     """
 
     steps: NDArray[np.float32]  # (RANKS,) ascending, filled up with inf
     shape: tuple[int, int, int]  # bricks along each axis
     shift: int  # a brick has 2^shift cells along each side
-    records: Bytes  # (bricks, 128) of each brick, in C order: first its cells, then its cubes towards the 8 octants
-    # cells: (BRICK³) in C order, the rank of the largest value at the corners of a cell, in a large field of 2³ cells
-    # cubes: (8, len(REACH)) the largest rank in the cube of so many bricks from here on; octants in C order, up is 1
+    records: Bytes  # (bricks, 128) for each brick, in C order: first its cells, then its cubes towards the 8 octants
+    # cells: (BRICK³) in C order, the rank of the largest value at the corners of a cell (of 2³ cells in a large field)
+    # cubes: (8, len(REACH)) the largest rank in the cube of so many bricks from here; octants in C order, up is 1
 
 
 def lay_bricks(values: NDArray[Any], sign: float = 1.0) -> Bricks:
     """Ranks of the cells of a field turned by `sign`, and of the cubes of bricks towards the eight octants.
 
-    Slab by slab: beside the bricks nothing as large as the field is made.
+    Works slab by slab, so that it needs no other array as large as the field.
     """
     steps = _steps(values, sign)
     shift = BRICK_SHIFT + (values.size >= LARGE)
@@ -67,7 +67,7 @@ def lay_bricks(values: NDArray[Any], sign: float = 1.0) -> Bricks:
 
 
 def _ranks_of_all(kind: np.dtype[Any], steps: NDArray[np.float32], sign: float) -> Bytes | None:
-    """The rank of each number that values of 8 or 16 bits can be, by its bits."""
+    """The rank of every possible value of 8 or 16 bits, by its bits."""
     if kind.itemsize > 2:
         return None
     numbers = np.arange(1 << 8 * kind.itemsize, dtype=f"u{kind.itemsize}").view(kind)
@@ -75,7 +75,7 @@ def _ranks_of_all(kind: np.dtype[Any], steps: NDArray[np.float32], sign: float) 
 
 
 def _cells(ranks: Bytes, shape: tuple[int, int, int], fine: int) -> Bytes:
-    """Of each brick (m, BRICK³): the largest rank at the corners of its fine³ cells each, 0 beyond the border."""
+    """For each brick (m, BRICK³), the largest rank at the corners of its groups of fine³ cells, 0 beyond the border."""
     for axis in range(3):
         line = np.moveaxis(ranks, axis, 0)
         ranks = np.moveaxis(np.maximum(line[:-1], line[1:]), 0, axis)
@@ -88,7 +88,7 @@ def _cells(ranks: Bytes, shape: tuple[int, int, int], fine: int) -> Bytes:
 
 
 def _aligned(bricks: int, size: int) -> Bytes:
-    """Room for records that lie on whole cache lines."""
+    """Memory for records that lie on whole cache lines."""
     room = np.empty(bricks * size + 64, np.uint8)
     first = -room.ctypes.data % 64
     return room[first : first + bricks * size].reshape(bricks, size)
@@ -113,7 +113,7 @@ def _steps(values: NDArray[Any], sign: float) -> NDArray[np.float32]:
 def _write_cubes(largest: Bytes, out: Bytes) -> None:
     """Write the largest rank in the cubes of REACH bricks that begin at each brick, (bricks, 8, len(REACH))."""
     for octant in range(8):
-        # Seen along the octant every axis goes up.
+        # Arranged along the octant, so that every axis goes up.
         turn = tuple(slice(None, None, 1 if octant >> (2 - axis) & 1 else -1) for axis in range(3))
         cube = largest[turn]
         side = 1
@@ -124,7 +124,7 @@ def _write_cubes(largest: Bytes, out: Bytes) -> None:
 
 
 def _reaching(cube: Bytes, side: int, reach: int) -> Bytes:
-    """Largest rank in cubes of `reach` bricks up each axis, from that in cubes of `side`: overlapping ones cover it."""
+    """Largest rank in cubes of `reach` bricks up each axis, from cubes of `side` that overlap to cover it."""
     for axis in range(3):
         line = np.moveaxis(cube, axis, 0)
         if reach >= len(line):

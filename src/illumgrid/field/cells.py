@@ -1,8 +1,8 @@
 """Periodic cells of any shape: the upright brick of the same volume that repeats by the same edges.
 
 With the first edge along x and the second in the plane of x and y, edges are a = (a₁, 0, 0), b = (b₁, b₂, 0) and c. The
-brick a₁ × b₂ × c₃ and its images fill space as the cell and its images do: what leaves it through a face comes back
-through the opposite one, moved along by what is left of the edge.
+brick a₁ × b₂ × c₃ and its images fill space as the cell and its images do: what leaves it through a face enters through
+the opposite one, shifted by the remaining components of the edge.
 """
 
 from dataclasses import dataclass
@@ -36,7 +36,7 @@ class Brick:
         volume = np.linalg.det(edges) if edges.shape == (3, 3) and np.isfinite(edges).all() else 0.0
         if not abs(volume) > 1e-9 * np.prod(np.linalg.norm(edges, axis=1)):
             raise BadInput(f"the edges of the cell are {edges.tolist()}; expected three that span a volume")
-        edges[2] *= np.sign(volume)  # the opposite of an edge is an edge of the same repetition
+        edges[2] *= np.sign(volume)  # replacing an edge by its opposite keeps the repetition
         axes, upper = np.linalg.qr(edges.T)
         signs = np.sign(np.diag(upper))
         return cls(upper.T * signs, signs[:, None] * axes.T)
@@ -49,7 +49,7 @@ class Brick:
     def images(self, points: Floats, weights: Floats, margin: Floats) -> tuple[Floats, Floats]:
         """Points (n, 3), world units, in the axes of the brick, once for each image within `margin` (3,) of it."""
         at = points @ self.axes.T
-        for axis in (2, 1, 0):  # c moves along all axes, b along two, a along one
+        for axis in (2, 1, 0):  # c moves an image along all axes, b along two, a along one
             edge = self.edges[axis]
             at = at - np.floor(at[:, axis] / edge[axis])[:, None] * edge
             reach = int(np.ceil(margin[axis] / edge[axis]))

@@ -8,9 +8,9 @@ from illumgrid.field.volume import AT_ONCE, Volume, index_to_world, slabs
 
 
 def block_means(volume: Volume, factors: Sequence[int]) -> Volume:
-    """Means over blocks of so many voxels along each axis, in the middle of each; the border voxel fills the last ones.
+    """Means over blocks of so many voxels along each axis, at their centres; the border voxel fills the last ones.
 
-    In slabs of whole blocks: beside the result nothing as large as the field is made.
+    Works in slabs of whole blocks, so that it needs no second array as large as the field.
     """
     x, y, z = (int(f) for f in factors)
     nx, ny, nz = (-(-n // f) for n, f in zip(volume.shape, (x, y, z)))

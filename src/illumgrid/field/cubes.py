@@ -1,4 +1,4 @@
-"""Marching cubes of scikit-image a few cells at a time: Ctrl-C waits for one piece, not for millions of triangles."""
+"""scikit-image's marching cubes, a few cells at a time, so that Ctrl-C need not wait for all triangles."""
 
 from typing import Literal
 
@@ -16,16 +16,16 @@ Winding = Literal["ascent", "descent"]
 def march(values: NDArray[np.float32], level: float, winding: Winding) -> tuple[Floats, NDArray[np.int64]]:
     """Vertices (k, 3), in indices, and faces (m, 3) of the level set of an array, as one call would number them.
 
-    The array is cut into slabs along the first axis, and each plane of cells into strips along the second where two
-    planes are too many. Along these axes vertices have more digits than one call gives them, whose single precision
-    holds the index and the share of the edge together.
+    The array is cut into slabs along the first axis, and each plane of cells into strips along the second if two planes
+    are too many. Along these axes vertices have more digits than from a single call, whose single precision must hold
+    the index and the fraction of the edge together.
     """
     rows, wide, deep = (n - 1 for n in values.shape)
     cut = 2 * wide * deep > AT_ONCE
     rows, wide = (1, max(1, AT_ONCE // (2 * deep) - 1)) if cut else (max(1, AT_ONCE // (wide * deep)), wide)
     vertices, faces, count = [np.zeros((0, 3))], [np.zeros((0, 3), np.int64)], 0
-    starts: list[int] = []  # of the slab before: where the faces begin that a strip meets
-    begins: list[int] = []  # of this one
+    starts: list[int] = []  # of the slab before: where the faces begin that a strip shares
+    begins: list[int] = []  # of this slab
     for first in range(0, values.shape[0] - 1, rows):
         met, starts, begins, done = np.concatenate(faces[-max(1, len(begins)) :]), begins, [], 0
         for low in range(0, values.shape[1] - 1, wide):

@@ -97,8 +97,8 @@ def deposit_in(brick: Brick, points: Floats, weights: Floats, lattice: GridSpec,
     """Density of points (n, 3), world units, in a periodic cell whose edges are not all upright.
 
     Images of the points are shared among voxels within and around the `lattice` of its brick, whose rim is then cut
-    off. The total is kept as exactly as elsewhere: a row of voxels shares out a point's whole weight wherever its image
-    lies between them, so that rows, and then planes, add up though images do not lie as the point does.
+    off. The total is preserved as exactly as elsewhere: a row of voxels receives a point's whole weight wherever its
+    image lies between them, so rows, and then planes, add up even though images lie elsewhere between voxels.
     """
     more = np.ceil(REACH * sigma / lattice.spacing).astype(int) + 2
     shape = lattice.shape + 2 * more

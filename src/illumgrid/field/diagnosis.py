@@ -1,6 +1,6 @@
-"""What will go wrong with a field, seen before any light is computed: each finding has a name, a place and a remedy.
+"""Expected problems of a field, found before any light is computed: each finding has a name, a place and a remedy.
 
-Critical isovalues are not findings: light jumps there in nature, too.
+Critical isovalues are not findings: the true light is discontinuous there, too.
 """
 
 from collections.abc import Iterator
@@ -24,25 +24,25 @@ _COUNTED = ("components", "tunnels", "cavities")
 _SIDE = 64  # voxels along the longest axis of the field on which they are counted
 
 
-_LOOKED_AT = 1 << 24  # voxels of a field of which all are looked at; of a larger one only some, where that will do
+_LOOKED_AT = 1 << 24  # voxels of a field that is examined as a whole; of a larger one only parts, where that suffices
 _BLOCK = 64  # voxels along a block of those
 _ENOUGH = 1 << 20  # pairs of voxels whose normals are compared
 
 _ROUGH = 0.5  # normals that turn this much from voxel to voxel are rough (see `turning`)
-_NOISY = 0.7  # reading by level and normal pays in the studio: lost at 0.61, won at 0.85 (docs/interpolators.md)
-_BLURS = (1.0, 1.5, 2.0, 3.0, 4.0)  # voxels; the first that leaves no rough normals is advised
-_SOOTHED = 0.8  # ... and if a blur by one voxel brings them to this share, it is noise and not shape
+_NOISY = 0.7  # `bilateral` pays in the studio from here on: it lost at 0.61 and won at 0.85 (docs/interpolators.md)
+_BLURS = (1.0, 1.5, 2.0, 3.0, 4.0)  # voxels; the first blur that leaves no rough normals is recommended
+_SOOTHED = 0.8  # ... and if a blur by one voxel reduces the turning to this share, it is noise and not shape
 _FLOOR = 0.12  # over turning²; within a factor of two on raw and blurred volumes of ten kinds (docs/stability.md)
 _FALLS = 0.7  # the power of nodes per voxel with which that falls; 0.5 to 0.8 on most (docs/speed_and_accuracy.md)
-_THIN = 0.25  # share of the surface of what is thinner than two nodes
-_FEW = 4  # voxels on the smaller side of a level set that hardly is one
+_THIN = 0.25  # share of the surface that bounds parts thinner than two nodes
+_FEW = 4  # voxels on the smaller side of a level set that hardly exists
 _TOUCHED = 1e-3  # share of the border's voxels that are solid
 _ANISOTROPY = 3.0
 
 
 @dataclass(frozen=True)
 class Finding:
-    """What will go wrong, reported before the light is computed.
+    """A problem, reported before the light is computed.
 
     Parameters
     ----------
@@ -51,7 +51,7 @@ class Finding:
     sentence : str
         What was found and where, and what to do.
     options : str
-        Of ``illumgrid run``, such as ``--smooth 1``, if they are what to do.
+        Options of ``illumgrid run`` that are the remedy, such as ``--smooth 1``; else empty.
     """
 
     name: str
@@ -62,9 +62,9 @@ class Finding:
 def turning(volume: Volume, low: float, high: float, blur: float = 0.0) -> float:
     """How much the normal turns from voxel to voxel on level sets of a range of stored values: its RMS, 2 sin(angle/2).
 
-    It is what a grid of one node per voxel has to resolve: 0.1 on smooth fields, 0.8 on raw magnetic resonance images,
-    1.4 where neighbouring normals have nothing to do with each other. 0 where the range has no voxels. A volume of more
-    than `_LOOKED_AT` voxels is looked at in blocks here and there, until they hold `_ENOUGH` pairs.
+    It is 0.1 on smooth fields, 0.8 on raw magnetic resonance images, 1.4 if neighbouring normals are independent, and 0
+    if the range has no voxels. A volume of more than `_LOOKED_AT` voxels is examined in random blocks until they hold
+    `_ENOUGH` pairs.
 
     Parameters
     ----------
@@ -72,7 +72,7 @@ def turning(volume: Volume, low: float, high: float, blur: float = 0.0) -> float
     low, high : float
         Stored values.
     blur : float
-        Voxels by which a Gaussian blurs the field before.
+        Standard deviation in voxels of a Gaussian that blurs the field first.
     """
     total, pairs, small = 0.0, 0, volume.stored.size <= _LOOKED_AT
     for block in _slabs_of(volume.shape) if small else _blocks_of(volume.shape):
@@ -84,9 +84,9 @@ def turning(volume: Volume, low: float, high: float, blur: float = 0.0) -> float
 
 
 def noisy(field: Field) -> bool:
-    """Whether the normals of the swept level sets turn so much that nodes are better read by level and normal.
+    """Whether the normals of the swept level sets turn so much that `bilateral` is the better interpolator.
 
-    Beside a surface of such data lie nodes whose own level sets are noise, with other normals and shadows of their own.
+    Next to a surface of such data, other nodes have level sets that are noise, with normals and shadows of their own.
     """
     return turning(field.volume, *field.stored_range) >= _NOISY
 
@@ -97,7 +97,7 @@ def _slabs_of(shape: tuple[int, int, int]) -> Iterator[tuple[slice, ...]]:
 
 
 def _blocks_of(shape: tuple[int, int, int]) -> Iterator[tuple[slice, ...]]:
-    """Blocks of `_BLOCK`³ voxels, all of them, in the order of chance but the same each time."""
+    """All blocks of `_BLOCK`³ voxels, in a random order that is always the same."""
     many = [-(-n // _BLOCK) for n in shape]
     for number in np.random.default_rng(0).permutation(int(np.prod(many))):
         at = np.unravel_index(number, many)
@@ -105,7 +105,7 @@ def _blocks_of(shape: tuple[int, int, int]) -> Iterator[tuple[slice, ...]]:
 
 
 def _turning_in(volume: Volume, block: tuple[slice, ...], low: float, high: float, blur: float) -> tuple[float, int]:
-    """Squared differences of normals, summed over neighbouring voxels of the range from a block on, and how many."""
+    """Sum of squared differences of normals between neighbouring voxels of the range in a block, and their number."""
     from scipy.ndimage import gaussian_filter
 
     v, around = volume.stored, int(4 * blur + 0.5) + 1  # as far as the Gaussian reaches, and a voxel for the slopes
@@ -128,7 +128,7 @@ def _turning_in(volume: Volume, block: tuple[slice, ...], low: float, high: floa
         other = list(one)
         other[axis] = slice(one[axis].start + 1, one[axis].stop + 1)
         b, found = gradient[tuple(other)], on[tuple(other)]
-        a = tuple(slice(s.start, s.start + n) for s, n in zip(one, found.shape))  # at the border there is one less
+        a = tuple(slice(s.start, s.start + n) for s, n in zip(one, found.shape))  # one fewer at the border
         both = on[a] & found
         total += float(np.square(gradient[a][both] - b[both], dtype=np.float64).sum())
         pairs += int(both.sum())
@@ -136,7 +136,7 @@ def _turning_in(volume: Volume, block: tuple[slice, ...], low: float, high: floa
 
 
 def _reduced(volume: Volume, longest: int) -> NDArray[Any]:
-    """The values on fewer voxels, blurred before so that nothing folds over; as they are where they are few."""
+    """The values on fewer voxels, blurred first against aliasing; unchanged if there are few."""
     from scipy.ndimage import gaussian_filter, map_coordinates
 
     spec = GridSpec.over(volume, min(longest, max(volume.shape)))
@@ -153,7 +153,7 @@ def _reduced(volume: Volume, longest: int) -> NDArray[Any]:
 
 
 def topology(solid: NDArray[np.bool_]) -> tuple[int, int, int]:
-    """Components, tunnels and cavities (the Betti numbers) of a set of voxels; pieces below 27 voxels do not count."""
+    """Components, tunnels and cavities (Betti numbers) of a set of voxels; pieces below 27 voxels are not counted."""
     from scipy.ndimage import label
     from skimage.measure import euler_number
 
@@ -173,8 +173,8 @@ def topology(solid: NDArray[np.bool_]) -> tuple[int, int, int]:
 def critical_isovalues(field: Field) -> list[tuple[float, str]]:
     """Isovalues of the range at which the topology of the level set changes, and what changes; light jumps there.
 
-    Counted on a field of at most 64 voxels a side at 64 isovalues; a change counts if what was before it and what
-    comes after it both last for a thirtieth of the range.
+    Counted on a field of at most 64 voxels per side at 64 isovalues; a change counts if the topologies before and after
+    it both persist for a thirtieth of the range.
     """
     small = _reduced(field.volume, _SIDE)
     low, high = field.stored_range
@@ -222,7 +222,7 @@ def _noise(field: Field, spec: GridSpec, smoothed: float) -> Iterator[Finding]:
     if turn < _ROUGH:
         return
     after = turn
-    for sigma in (s for s in _BLURS if s > smoothed):  # of the data as they came: variances of blurs add up
+    for sigma in (s for s in _BLURS if s > smoothed):  # of the original data: variances of blurs add up
         more = min(float(np.sqrt(sigma**2 - smoothed**2)), max(field.volume.shape))
         after = turning(field.volume, low, high, more)
         if after < _ROUGH or after >= _SOOTHED * turn:
@@ -258,7 +258,7 @@ def _crossings(values: NDArray[Any], isovalue: np.float64, most: int) -> Floats:
 
 
 def _crossed_edges(values: NDArray[Any], slab: slice, isovalue: np.float64) -> Iterator[NDArray[np.bool_]]:
-    """Along each axis, the edges from the voxels of a slab on that a level set crosses."""
+    """Along each axis, the edges that begin at the voxels of a slab and that a level set crosses."""
     solid = values[slab.start : slab.stop + 1] >= isovalue
     yield solid[1:] != solid[:-1]
     solid = solid[: slab.stop - slab.start]
@@ -319,7 +319,7 @@ def _empty(field: Field) -> Iterator[Finding]:
 
 
 def _below_each(volume: Volume, levels: Floats) -> NDArray[np.int64]:
-    """How many voxels lie below each of some stored levels, increasing."""
+    """Number of voxels below each of some stored levels, increasing."""
     if volume.stored.dtype.kind != "f":
         values, counts = volume.tally
         return np.concatenate([[0], np.cumsum(counts)])[np.searchsorted(values, levels)]
@@ -365,7 +365,7 @@ def _labels(field: Field) -> Iterator[Finding]:
 
 
 def diagnose(field: Field, spec: GridSpec, smoothed: float = 0.0, flat: list[Plateau] | None = None) -> list[Finding]:
-    """All that warns of a field under its range and the grid meant for it, which was blurred by `smoothed` voxels.
+    """All findings about a field, its range and its planned grid; `smoothed` voxels of blur were already applied.
 
     `flat` are its `plateaus`, where they are known already.
     """

@@ -1,4 +1,4 @@
-"""What changes the values of a volume before it is lit: gaps are filled, noise is blurred."""
+"""Changes of the values of a volume before it is lit: gaps are filled, noise is blurred."""
 
 import numpy as np
 
@@ -28,7 +28,7 @@ def finite(volume: Volume, inside: Side) -> Volume:
 def smooth(volume: Volume, sigma: float) -> Volume:
     """Blur by a Gaussian with a standard deviation of `sigma` voxels (for noisy data); 0 changes nothing."""
     longest = max(volume.shape)
-    if not 0 <= sigma <= longest:  # a larger blur leaves nothing, and its kernel may exceed the memory
+    if not 0 <= sigma <= longest:  # a larger blur leaves nothing, and its kernel might not fit into memory
         raise BadInput(f"smoothing by {sigma} voxels; expected a number from 0 to {longest}, the longest axis")
     if sigma == 0:
         return volume

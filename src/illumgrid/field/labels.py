@@ -11,19 +11,19 @@ COLOURS = (
     *((0.80, 0.80, 0.80), (0.75, 0.30, 0.01), (0.09, 0.36, 0.65), (0.02, 0.36, 0.18), (0.67, 0.55, 0.06)),
     *((0.60, 0.19, 0.38), (0.01, 0.16, 0.42), (0.60, 0.14, 0.01)),
 )
-"""Albedos that differ for eyes of all kinds: grey and those of Okabe and Ito, in linear light."""
+"""Albedos that people with any colour vision can distinguish: grey and those of Okabe and Ito, in linear light."""
 
-MOST = 300  # values of a label map; atlases of the brain have up to that
-_SAMPLE = 1 << 21  # voxels that are looked at
-_EQUAL = 0.6  # share of neighbours in a label map that are equal, the background left out
-_LEAP = 0.1  # share of steps that pass over a value, in a label map of many values; a smooth field passes over none
-_FEW = 8  # values that a map of nested labels may have, whose steps pass over none
+MOST = 300  # values of a label map; atlases of the brain have up to this number
+_SAMPLE = 1 << 21  # voxels that are examined
+_EQUAL = 0.6  # share of equal neighbours in a label map, without the background
+_LEAP = 0.1  # share of steps that skip a value, in a label map of many values; a smooth field skips none
+_FEW = 8  # values that a map of nested labels may have, whose steps skip none
 
 
 def labels_in(volume: Volume) -> list[int]:
-    """Labels of a volume that looks like a label map or a mask, without its background; none if it does not.
+    """Labels, without the background, of a volume that looks like a label map or a mask; none if it does not.
 
-    Such a volume has few values, all whole numbers, and is constant but for steps.
+    Such a volume has few different values, all whole numbers, and is constant except for steps.
     """
     stride = max(1, int(np.ceil(np.sqrt(volume.stored.size / _SAMPLE))))
     sample = volume.in_units(volume.stored[:, ::stride, ::stride])
@@ -54,7 +54,7 @@ def around_zero(volume: Volume) -> tuple[float, float]:
 
 
 def fields_of(name: str, volumes: Mapping[int, Volume], albedo: Floats | None, limits: Floats | None) -> list[Field]:
-    """A field for each label, in colours that differ.
+    """A field for each label, in different colours.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""The lights of a scene as layers, and what each channel of a computation sees of them.
+"""The lights of a scene as layers, and the columns of light that each channel of a computation has.
 
 Light is linear, so each light is stored separately: one layer for each name. All channels share their paths, and
 differ in the columns of the tables here.
@@ -54,7 +54,7 @@ class Channel(NamedTuple):
 
 
 def _sources(scene: Scene) -> list[tuple[str, Floats]]:
-    """Name and colours (..., 3) of everything that shines, but for `Harmonics`."""
+    """Names and colours (..., 3) of everything that emits light, except for `Harmonics`."""
     found = [(SKY, scene.background)]
     found += [(light.name, light.radiance) for light in scene.lights if not isinstance(light, Harmonics)]
     found += [(field.name, field.material.emission) for field in scene.fields]
@@ -97,7 +97,7 @@ def layers_of(scene: Scene) -> tuple[Layer, ...]:
 
 
 def _seen(channel: Channel, name: str, color: Floats) -> Floats:
-    """What a channel sees (...) of the colour (..., 3) of a light."""
+    """The columns (...) of a channel for the colour (..., 3) of a light."""
     if channel.layer is None:
         return color[..., channel.color]
     if channel.layer.name != name:
@@ -113,7 +113,7 @@ ALL = tuple(Channel(None, color) for color in range(3))
 
 
 def light_tables(scene: Scene, channels: Sequence[Channel]) -> dict[str, Any]:
-    """The arrays of a `Marchable` that say what light there is, but for where quads are."""
+    """The arrays of a `Marchable` that describe its lights, except for the positions of quads."""
     frame, axes = scene.fields[0].volume.direction, sky_axes(scene)
     shining = [(f.name, f.material.emission) for f in scene.fields]
     shining += [(q.light or q.name, q.material.emission) for q in scene.quads]
@@ -123,7 +123,7 @@ def light_tables(scene: Scene, channels: Sequence[Channel]) -> dict[str, Any]:
             background += [_seen(c, light.name, light.radiance) for c in channels]
     discs = [light for light in scene.lights if isinstance(light, Distant) and light.irradiance.any()]
     images = [s for s in scene.lights if isinstance(s, Sky) and s.radiance.ndim == 3 and s.radiance.any()]
-    # One ray asks for light that a cosine finds badly: all lamps, all images, and each disc in equal parts.
+    # One ray samples light that cosine-distributed rays find badly: lamps, images, and each disc in equal parts.
     lamps = any(q.material.emission.any() for q in scene.quads)
     parts = np.array([float(lamps), float(bool(images)), *np.ones(len(discs))])
     chances = parts / max(parts.sum(), 1.0)
@@ -172,7 +172,7 @@ def _harmonics(scene: Scene, channels: Sequence[Channel], axes: Floats) -> Float
 
 
 def _images(images: list[Sky], channels: Sequence[Channel]) -> Floats:
-    """Sum of the images (H, W, C) on the finest of their lattices."""
+    """Sum of the images (H, W, C) at the finest of their resolutions."""
     if not images:
         return np.zeros((0, 0, len(channels)))
     shape = np.max([light.radiance.shape[:2] for light in images], axis=0)
@@ -184,7 +184,7 @@ def _images(images: list[Sky], channels: Sequence[Channel]) -> Floats:
 
 
 def resampled(image: Floats, rows: int, columns: int) -> Floats:
-    """An image of the sky (h, w, C) at other resolution: bilinear, the azimuth periodic."""
+    """An image of the sky (h, w, C) at another resolution: bilinear, the azimuth periodic."""
     h, w, _ = image.shape
     if (h, w) == (rows, columns):
         return image
@@ -197,10 +197,10 @@ def resampled(image: Floats, rows: int, columns: int) -> Floats:
 
 
 def _asked_pixels(images: list[Sky], chance: float) -> dict[str, Floats]:
-    """Probabilities with which pixels are asked for their light: by brightness and solid angle, images in equal parts.
+    """Probabilities with which pixels are sampled: by brightness and solid angle, each image with equal probability.
 
-    The brightness is the mean over the pixel of what interpolation shows there: half the light of a small sun comes
-    from beyond its pixels. A tenth goes evenly to all directions.
+    The brightness is the mean over the pixel of the interpolated image: half the light of a small sun comes from beyond
+    its pixels. A tenth of the samples goes evenly to all directions.
     """
     if not images:
         return {"image_rows": np.zeros(0), "image_columns": np.zeros((0, 0)), "image_density": np.zeros((0, 0))}

@@ -102,14 +102,14 @@ class Marchable(NamedTuple):
     """All fields of a scene as flat arrays for marching by a compiled kernel, in the frame of the scene.
 
     The solid of every field is {sign v >= level}: for `inside` "below" the sign is -1, and levels change theirs too.
-    The bricks serve every isovalue. A field that transmits has a second entry, after all F fields, whose solid is what
-    is outside: rays within its shell march that one, with minus the level.
+    The bricks serve every isovalue. A field that transmits has a second entry, after all F fields, whose solid is the
+    outside: rays within its shell march that entry, with minus the level.
     """
 
     values: NDArray[Any]  # of one of the types `field.volume.NATIVE`: all volumes one after the other, C order
-    twin: NDArray[np.int64]  # (F,) entry of what is outside of a field that transmits; -1 for others
+    twin: NDArray[np.int64]  # (F,) entry of the outside of a field that transmits; -1 for others
     transmission: Floats  # (F,), or (0,) if no field transmits
-    # Here and up to the bricks the entries of fields, E of them: F, or more if some transmit.
+    # From here to the bricks there are E entries of fields: F, or more if some transmit.
     sign: Floats  # (E,)
     start: NDArray[np.int64]  # (F,) offset of each field
     shape: NDArray[np.int64]  # (F, 3) voxels
@@ -117,46 +117,46 @@ class Marchable(NamedTuple):
     spacing: Floats  # (F, 3)
     steps: NDArray[np.float32]  # (F, RANKS) as in `illumgrid.field.bricks`
     bricks: NDArray[np.uint8]  # 128 bytes per brick, all fields concatenated
-    brick_start: NDArray[np.int64]  # (F,) how many bricks come before
+    brick_start: NDArray[np.int64]  # (F,) number of bricks before
     brick_shape: NDArray[np.int64]  # (F, 3)
     shift: NDArray[np.int64]  # (E,) a brick has 2^shift cells along each side
-    albedo: Floats  # (F + Q, 3): fields, then quads; share that is reflected of what is not transmitted
+    albedo: Floats  # (F + Q, 3) fields, then quads: share of the light not transmitted that is reflected
     emission: Floats  # (F + Q, 3)
     background: Floats  # (3,) constant radiance from all directions outside
     quad_corner: Floats  # (Q, 3) in the frame, as all that follows
     quad_edges: Floats  # (Q, 2, 3)
     quad_duals: Floats  # (Q, 2, 3): dot with a point from the corner gives its shares (0 to 1) along the edges
     quad_normal: Floats  # (Q, 3) towards the front
-    quad_size: Floats  # (Q,) size of its edges, the scale of rounding errors
+    quad_size: Floats  # (Q,) length of its edges, the scale of rounding errors
     lamps: NDArray[np.int64]  # (L,) numbers of the quads that emit
     lamp_share: Floats  # (L,) cumulative probability of choosing a lamp, proportional to its power
     lamp_density: Floats  # (Q,) probability density per area of choosing a point of the quad; 0 if it does not emit
     lamplight: Floats  # (3,) radiance of all lamps spread over a box around the scene, of all discs over the sky
-    # What other distant light is, in C channels; directions in the frame, or along the axes of the sky.
+    # Other distant light, in C channels; directions in the frame, or along the axes of the sky.
     sky_axes: Floats  # (3, 3) rows right, back, up in the frame
-    usual: Floats  # (C,) radiance of the sky in the mean, discs left out
+    usual: Floats  # (C,) mean radiance of the sky without discs
     harmonics: Floats  # (B, C) coefficients of the smooth skies; B is 0, or that of a whole degree
     disc_axis: Floats  # (D, 3) frame directions to the middles
-    disc_cosine: Floats  # (D,) of half the angle
+    disc_cosine: Floats  # (D,) cosine of the half-angle
     disc_radiance: Floats  # (D, C)
-    disc_density: Floats  # (D,) density per solid angle with which its directions are asked for
+    disc_density: Floats  # (D,) probability density per solid angle of sampling its directions
     image: Floats  # (H, W, C) sum of the images; (0, 0, C) if there is none
     image_rows: Floats  # (H,) cumulative probability of a row
     image_columns: Floats  # (H, W) cumulative probability of a pixel in its row
-    image_density: Floats  # (H, W) density per solid angle, as for discs
-    asked: Floats  # (2 + D,) cumulative probability of asking lamps, the image, each disc
+    image_density: Floats  # (H, W) probability density per solid angle, as for discs
+    asked: Floats  # (2 + D,) cumulative probability of sampling lamps, the image, each disc
 
 
 def _together(volumes: Sequence[Volume]) -> tuple[NDArray[Any], NDArray[np.int64]]:
-    """The values of volumes as one flat array, and where each begins: a single volume is not copied."""
+    """The values of volumes as one flat array, and where each begins; a single volume is not copied."""
     parts = list({id(volume.stored): volume.stored.reshape(-1) for volume in volumes}.items())
     ends = np.cumsum([0, *(len(values) for _, values in parts)], dtype=np.int64)
     first = {key: start for (key, _), start in zip(parts, ends)}
     kind = np.result_type(*(values for _, values in parts))
     together = parts[0][1].view()
-    if len(parts) > 1:  # of two types that no small one holds, all are promoted
+    if len(parts) > 1:  # two types that no small type holds: all are promoted
         together = np.concatenate([v for _, v in parts], dtype=kind if kind in NATIVE else np.float32)
-    together.setflags(write=False)  # like a single volume: otherwise Numba compiles all kernels for a second type
+    together.setflags(write=False)  # as for a single volume; otherwise Numba compiles all kernels for a second type
     return together, np.array([first[id(volume.stored)] for volume in volumes])
 
 
@@ -164,7 +164,7 @@ _LAID: WeakKeyDictionary[Volume, dict[float, Bricks]] = WeakKeyDictionary()
 
 
 def _bricks_of(volume: Volume, sign: float) -> Bricks:
-    """Bricks of a volume, laid once for as long as it lives: bake, judgement and picture use the same."""
+    """Bricks of a volume, laid once for its lifetime: bake, measurement of the error and pictures share them."""
     laid = _LAID.setdefault(volume, {})
     if sign not in laid:
         laid[sign] = lay_bricks(volume.stored, sign)
@@ -239,7 +239,7 @@ def _quads_in_frame(scene: Scene, lights: dict[str, Floats]) -> dict[str, NDArra
 
 
 def turned_levels(scene: Scene, levels: Floats) -> Floats:
-    """Isovalues (..., F) for comparison with the values of a `Marchable`: as stored, with the sign of `upward`."""
+    """Isovalues (..., F) for comparison with the values of a `Marchable`: as stored, times the sign `upward`."""
     sign = np.array([field.upward for field in scene.fields])
     stored = np.stack([f.volume.to_stored(levels[..., k]) for k, f in enumerate(scene.fields)], axis=-1)
     return np.asarray(stored * sign, np.float64)

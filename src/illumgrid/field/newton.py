@@ -17,14 +17,14 @@ STEPS = 24
 
 @jit
 def cell_of(u, points):
-    """Cell that contains index u along an axis of so many points, and the place in it, 0 to 1."""
+    """Cell that contains index u along an axis of so many points, and the position within it, 0 to 1."""
     cell = int(min(max(np.floor(u), 0.0), points - 2.0))
     return cell, min(max(u - cell, 0.0), 1.0)
 
 
 @jit
 def value_at(values, x, y, z):
-    """Value at an index, as ``scipy.ndimage.map_coordinates`` of order 1 has it: clamped to the border."""
+    """Value at an index, like ``scipy.ndimage.map_coordinates`` of order 1: clamped to the border."""
     nx, ny, nz = values.shape
     x, y, z = min(max(x, 0.0), nx - 1.0), min(max(y, 0.0), ny - 1.0), min(max(z, 0.0), nz - 1.0)
     a, b, c = int(x), int(y), int(z)
@@ -109,7 +109,7 @@ def slope_to_follow(values, spacing, x, y, z):
 
 @jit
 def onto(values, spacing, level, x, y, z):
-    """The point of a level set to which Newton's steps lead from index (x, y, z), and whether they arrived."""
+    """The point of a level set that Newton steps from index (x, y, z) reach, and whether they converged."""
     top_x, top_y, top_z = values.shape[0] - 1.0, values.shape[1] - 1.0, values.shape[2] - 1.0
     last = np.inf
     for _ in range(STEPS):

@@ -1,4 +1,4 @@
-"""Meshes that other programs made, on the level sets of a field."""
+"""Meshes of other programs, moved onto level sets of a field."""
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -20,8 +20,8 @@ def onto_levels(field: Field, points: ArrayLike, isovalue: float | None = None) 
     points : (n, 3) array_like
         World positions, as those of the vertices of a decimated isosurface, or of the surface of a segmentation.
     isovalue : float, optional
-        Level set that they all lie on. By default each lies on the level set through itself, and one whose level is
-        outside the range moves onto the nearest level that is within.
+        Level set for all points. By default each is on the level set through itself; one whose level is outside the
+        range moves onto the nearest level within.
 
     Returns
     -------
@@ -30,7 +30,7 @@ def onto_levels(field: Field, points: ArrayLike, isovalue: float | None = None) 
     Raises
     ------
     BadInput
-        If the isovalue is outside the range, or some points lie too far off; the sentence says how many.
+        If the isovalue is outside the range, or some points lie too far away; the message gives their number.
     """
     low, high = field.range
     if isovalue is not None and not low <= isovalue <= high:
@@ -45,7 +45,7 @@ def onto_levels(field: Field, points: ArrayLike, isovalue: float | None = None) 
     own = interpolate(field.volume, near)
     levels = np.clip(own, low, high) if isovalue is None else np.full(len(world), float(isovalue))
     least, most = field.volume.extremes
-    # From nearer, Newton steps may leave rough data, or not end.
+    # From closer points, Newton steps may leave rough data, or not end.
     moving = np.abs(own - levels) > SINGLE * (most - least)
     at, arrived = near.copy(), np.ones(len(world), bool)
     at[moving], arrived[moving] = project(field.volume, near[moving], levels[moving])

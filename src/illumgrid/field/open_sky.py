@@ -1,4 +1,4 @@
-"""What the open sky brings to a flat face with nothing before it: a sum of closed forms, one for each kind of light."""
+"""Irradiance of a flat face under an unobstructed sky: a sum of closed forms, one for each kind of light."""
 
 from collections.abc import Sequence
 
@@ -10,7 +10,7 @@ from illumgrid.field.scene import Scene
 from illumgrid.field.volume import Floats
 
 COSINE = np.pi * np.array([1, 2 / 3, 1 / 4, 0, -1 / 24])
-"""What a diffuse surface receives of spherical harmonics of each degree (Ramamoorthi and Hanrahan 2001)."""
+"""Factors from spherical harmonics of each degree to irradiance (Ramamoorthi and Hanrahan 2001)."""
 _ROWS = 512  # of an image, at least: sums over pixels are then within 1e-5 of the integral of what lies between them
 
 

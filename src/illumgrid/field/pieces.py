@@ -1,4 +1,4 @@
-"""Flat cells that hang together, numbered plane by plane, compiled: imported where it is first used, no state."""
+"""Connected components of flat cells, numbered plane by plane, compiled: imported on first use, no state."""
 
 import numpy as np
 
@@ -9,7 +9,7 @@ jit = njit(_nrt=False)
 
 @jit
 def root(parent, number):
-    """The first of the numbers that stand for the same piece."""
+    """The first of the numbers that stand for the same component."""
     while parent[number] != number:
         parent[number] = parent[parent[number]]
         number = np.int64(parent[number])
@@ -18,7 +18,7 @@ def root(parent, number):
 
 @jit
 def joined(parent, one, other):
-    """A number for what two numbers stand for, which becomes one piece; -1 stands for nothing."""
+    """Join the components of two numbers and return a number for both; -1 stands for none."""
     if one < 0 or one == other:
         return other
     if other < 0:

@@ -1,4 +1,4 @@
-"""Where a field is flat, in pieces that hang together: a level set has no normal there."""
+"""Connected regions in which a field is constant: a level set has no normal there."""
 
 from collections.abc import Iterator
 from typing import Any, NamedTuple
@@ -9,14 +9,14 @@ from numpy.typing import NDArray
 from illumgrid.field.volume import Floats, Volume, index_to_world, slabs
 
 FEWEST = 27
-"""Flat cells that hang together: fewer are what integers do at every maximum."""
+"""Connected flat cells: integer data have fewer at every maximum."""
 
 Plateau = tuple[float, float, Floats]
 """Value, share of all cells, and the world position (3,) of a cell of the largest piece."""
 
 
 def plateaus(volume: Volume) -> list[Plateau]:
-    """Values on which the field is flat over `FEWEST` cells or more that hang together, lowest first.
+    """Values at which the field is constant over `FEWEST` connected cells or more, lowest first.
 
     Returns
     -------
@@ -41,17 +41,17 @@ def plateaus(volume: Volume) -> list[Plateau]:
 
 
 class Pieces(NamedTuple):
-    """Flat cells that hang together."""
+    """Connected components of flat cells."""
 
     size: NDArray[np.int64]  # (n,) cells in each piece
     first: NDArray[np.int64]  # (n,) flat number of its first cell
 
 
 def _flat_pieces(v: NDArray[Any]) -> Iterator[Pieces]:
-    """All pieces, in no order, some at a time: a piece is known when a slab ends that it does not leave.
+    """All components, in no order, slab by slab: a component is complete when a slab ends that it does not leave.
 
-    Beside a slab only the pieces are held that go on into the next one, which are no more than its plane has cells: a
-    field without noise may have as many small pieces as a tenth of its voxels.
+    Apart from a slab, only the components that continue into the next one are held, at most as many as a plane has
+    cells: a field without noise may have as many small components as a tenth of its voxels.
     """
     from illumgrid.field.pieces import number_cells
 
@@ -64,7 +64,7 @@ def _flat_pieces(v: NDArray[Any]) -> Iterator[Pieces]:
         sizes[: len(size)], firsts[: len(first)] = size, first
         count = number_cells(flat, plane, parent, sizes, firsts, rows.start * plane.size, len(size))
         goes_on, whole = np.zeros(count + 1, bool), parent[:count] == np.arange(count)
-        goes_on[plane] = True  # -1, of no piece, is the last
+        goes_on[plane] = True  # the last entry, -1, belongs to no component
         ends, goes_on = whole & ~goes_on[:-1], goes_on[:-1]
         yield Pieces(sizes[:count][ends], firsts[:count][ends])
         size, first = sizes[:count][goes_on], firsts[:count][goes_on]

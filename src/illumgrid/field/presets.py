@@ -1,4 +1,4 @@
-"""Ready-made scenes around one volume that need more than a sky: the light of a photographer's studio."""
+"""Scenes around one volume that need more than a sky: the light of a photographer's studio."""
 
 import numpy as np
 
@@ -8,19 +8,19 @@ from illumgrid.field.upright import sky_axes
 from illumgrid.field.volume import Floats
 
 ALBEDO = (0.65, 0.65, 0.65)
-"""Neutral, and not so white that light between its folds washes out their shadows."""
+"""A neutral grey, dark enough that light between folds does not wash out their shadows."""
 GROUND = 0.4
-"""Albedo of the floor: darker than the object, with room for shadows."""
+"""Albedo of the floor: darker than the object, so that shadows remain visible."""
 KEY, DOME = "key", "dome"
 AZIMUTH, ELEVATION, ANGLE = -20.0, 40.0, 25.0
-"""Of the key, degrees: 50 to the left of the default view, which is 30 to the right of the front; half its size."""
+"""Of the key, in degrees: 50 to the left of the default view (itself 30 to the right of the front); half-angle."""
 RATIO = 16.0
 """Irradiance by the key over that by the dome, on a surface that faces the key."""
 WARM, COOL = (1.03, 1.0, 0.94), (0.92, 0.99, 1.09)
 
 
 def studio_lights(scene: Scene) -> tuple[Light, ...]:
-    """A soft warm key from the upper left front, and a dim cool dome; both together are as bright as a sky of 1."""
+    """A soft warm key from the upper left front and a dim cool dome; together as bright as a sky of radiance 1."""
     back, up = sky_axes(scene)[1:]
     right = sky_axes(scene)[0]
     azimuth, elevation = np.radians((AZIMUTH, ELEVATION))

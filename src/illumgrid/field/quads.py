@@ -1,4 +1,4 @@
-"""Materials, and parallelograms that have them: walls and lamps."""
+"""Materials, and parallelograms with a material: walls and lamps."""
 
 from dataclasses import dataclass, field
 
@@ -10,7 +10,7 @@ from illumgrid.field.volume import Floats
 
 
 def rgb(value: ArrayLike, name: str, at_most: float) -> Floats:
-    """A colour (3,) that cannot be written to, or a refusal that begins with its name."""
+    """Check a colour: read-only (3,), or a refusal that begins with its name."""
     color = np.array(value, dtype=float)
     if color.shape != (3,) or not np.isfinite(color).all() or (color < 0).any() or (color > at_most).any():
         upper = "up" if at_most == np.inf else f"to {at_most:g}"
@@ -35,10 +35,10 @@ class Material:
         Fraction of the light that goes straight through, 0 to 1: the solid of a field is then a thin shell, with light
         inside. What is neither reflected nor transmitted is absorbed.
     roughness : float, optional
-        Of a clear coat, from 0, a mirror, to 1. Pictures only: light paths know nothing of coats. None: no coat.
+        Of a clear coat, from 0, a mirror, to 1; None for no coat. Pictures only: light paths do not include coats.
     translucent : float
-        Share of what lies behind that pictures show through the surface. Pictures only: light does not enter the solid;
-        what `transmission` lets through is seen anyway.
+        Share of what lies behind that pictures show through the surface. Pictures only: light does not enter the solid.
+        Pictures show what lies behind a surface with `transmission` in any case.
     """
 
     albedo: Floats = field(default_factory=lambda: np.full(3, 0.8))
@@ -66,7 +66,7 @@ class Material:
 
     @property
     def plain(self) -> bool:
-        """Whether pictures need no rays for it: no coat, and nothing is seen through it."""
+        """Whether pictures need no rays for it: no coat and no translucency."""
         return self.roughness is None and not (self.transmission or self.translucent)
 
 
@@ -85,7 +85,7 @@ class Quad:
     texels : (2,) tuple of int
         Resolution of its light texture along edge_u and edge_v.
     light : str, optional
-        Name of its light if it emits: lights of one name are one layer. By default that of the quad.
+        Name of its light if it emits; lights with the same name are one layer. By default the name of the quad.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""Walls around a volume, and how finely their light is kept."""
+"""Walls around a volume, and the resolution of their light."""
 
 from dataclasses import replace
 
@@ -36,7 +36,7 @@ def _wall(name: str, centre: Floats, u: Floats, v: Floats, albedo: Floats) -> Qu
 
 
 def square_texels(quad: Quad, per_length: float) -> Quad:
-    """The quad with texels as square as they can be, so many per world unit."""
+    """The quad with texels that are as square as possible, so many per world unit."""
     edges = (float(np.linalg.norm(edge)) for edge in (quad.edge_u, quad.edge_v))
     nu, nv = (max(1, round(per_length * edge)) for edge in edges)
     return replace(quad, texels=(nu, nv))
@@ -49,7 +49,7 @@ def _texel(volume: Volume, longest: float) -> int:
 
 
 def fitting_texels(quad: Quad, volume: Volume) -> Quad:
-    """A wall beside a volume with square texels, as many as those of `box_around`; one where no light is reflected."""
+    """A wall beside a volume with square texels, as many as in `box_around`; one texel if it reflects no light."""
     if not quad.material.albedo.any():
         return replace(quad, texels=(1, 1))
     longest = max(float(np.linalg.norm(edge)) for edge in (quad.edge_u, quad.edge_v))

@@ -1,4 +1,4 @@
-"""What is lit: fields, quads and their materials, and the background light."""
+"""Scenes: fields, quads and their materials, and the lights."""
 
 from dataclasses import dataclass, field, replace
 
@@ -16,11 +16,11 @@ from illumgrid.field.rooms import box_around, floor_under, square_texels
 from illumgrid.field.volume import UPWARD, Floats, Side, Volume
 
 _HELD = 1e-5
-"""Half the width of the range of a level that is held, as a share of the data's: nodes beside it are on it."""
+"""Half the width of the range of a held level, as a share of the data's span."""
 
 
 def _around(volume: Volume, name: str, isovalue: float) -> Floats:
-    """The range (2,) of a level that is held."""
+    """The range (2,) of a held level."""
     low, high = volume.extremes
     if not low <= isovalue <= high:
         raise BadInput(
@@ -47,8 +47,8 @@ class Field:
     falling : bool
         Whether the sweep runs from the high end of the range to the low end.
     isovalue : float, optional
-        A level that is held while the other fields sweep: a fixed body beside them. It takes the place of `range`, and
-        the body's light is known at several places of the sweep: see `IlluminationGrid.lookup`.
+        A level that is held while the other fields sweep: a body that does not change. It replaces `range`; the body's
+        light is computed at several positions of the sweep: see `IlluminationGrid.lookup`.
     """
 
     name: str
@@ -115,7 +115,7 @@ class Field:
     def place(self, isovalues: ArrayLike) -> Floats:
         """Position of isovalues in the sweep: 0 at its first isovalue, 1 at its last, not clamped.
 
-        Of a level that is held, the middle: it says nothing of the other fields.
+        For a held level, the middle, since it does not determine the other fields.
         """
         if self.isovalue is not None:
             return np.full(np.shape(isovalues), 0.5)
@@ -125,7 +125,7 @@ class Field:
 
 @dataclass(frozen=True, eq=False)
 class Levels:
-    """A table of isovalues: row k is one setting of all sliders.
+    """A table of isovalues; each row is one setting of the common sweep.
 
     Parameters
     ----------

@@ -14,7 +14,7 @@ POSITIVE, NEGATIVE = COLOURS[1], COLOURS[2]
 
 
 def without_gaps(volume: Volume) -> Volume:
-    """Voxels that are not finite become 0, which no surface encloses; with a warning."""
+    """Replace voxels that are not finite by 0, which no surface encloses, with a warning."""
     if not volume.gaps:
         return volume
     good = np.isfinite(volume.stored)

@@ -1,4 +1,4 @@
-"""What a volume stores of the values it is given: their own type, wherever that is small, and a slope and intercept."""
+"""How a volume stores its values: in their own type if that is small, with a slope and intercept."""
 
 import mmap
 from collections.abc import Iterator, Sequence
@@ -9,14 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 NATIVE = tuple(map(np.dtype, ("uint8", "int8", "uint16", "int16", "float32")))
-"""Types of values that are kept as they come: each number of theirs is one of single precision."""
+"""Types of values that are stored as given: single precision represents all their numbers."""
 
 DIGITS = 1e-5
-"""Share of the span of a field that rounding to single precision may cost it."""
+"""Share of the span of a field that rounding to single precision may cost."""
 
 
 def as_stored(values: NDArray[Any], slope: float, intercept: float) -> tuple[NDArray[Any], float, float]:
-    """The same field with values of a `NATIVE` type, as they came where one holds them well, and a positive slope."""
+    """The same field with values of a `NATIVE` type, unchanged if one represents them well, and a positive slope."""
     values, slope, intercept = _upward(values, slope, intercept)
     native = values.dtype.newbyteorder("=")
     if values.dtype == np.bool_:
@@ -30,7 +30,7 @@ def as_stored(values: NDArray[Any], slope: float, intercept: float) -> tuple[NDA
 
 
 def _upward(values: NDArray[Any], slope: float, intercept: float) -> tuple[NDArray[Any], float, float]:
-    """The same field with a positive slope; values of 8 or 16 bits are turned within their type."""
+    """The same field with a positive slope; integers of 8 or 16 bits are inverted within their type."""
     if slope > 0:
         return values, slope, intercept
     if values.dtype.newbyteorder("=") in NATIVE and values.dtype.kind in "iu":
@@ -40,7 +40,7 @@ def _upward(values: NDArray[Any], slope: float, intercept: float) -> tuple[NDArr
 
 
 def _whole_numbers(values: NDArray[Any], slope: float, intercept: float) -> tuple[NDArray[Any], float, float]:
-    """The same field without slope and intercept, where they are whole and h fits into a type as small as that of v."""
+    """The same field without slope and intercept, if these are whole and h fits into a type of the same size."""
     kind = values.dtype
     plain = (slope, intercept) == (1, 0)
     if kind.kind == "f" or plain or not (slope.is_integer() and intercept.is_integer() and slope < 2**32):
@@ -48,7 +48,7 @@ def _whole_numbers(values: NDArray[Any], slope: float, intercept: float) -> tupl
     low, high = (int(end) * int(slope) + int(intercept) for end in (values.min(), values.max()))
     for other in (kind, np.dtype(f"u{kind.itemsize}"), np.dtype(f"i{kind.itemsize}")):
         if np.iinfo(other).min <= low and high <= np.iinfo(other).max:
-            whole = np.empty(values.shape, other)  # what wraps around on the way comes back: the result fits
+            whole = np.empty(values.shape, other)  # intermediate results may wrap around; the final ones fit
             np.multiply(values, int(slope), out=whole, dtype=np.int64, casting="unsafe")
             np.add(whole, int(intercept), out=whole, dtype=np.int64, casting="unsafe")
             return whole, 1.0, 0.0
@@ -62,7 +62,7 @@ def single_precision_holds(low: float, high: float) -> bool:
 
 
 def _for_single_precision(values: NDArray[Any], slope: float, intercept: float) -> tuple[NDArray[Any], float, float]:
-    """The same field with values that single precision holds well: as they came, wherever it does."""
+    """The same field with values that single precision represents well, unchanged wherever possible."""
     wide = values.astype(np.float64) if values.dtype != np.float64 else values
     good = np.isfinite(wide)
     if not good.any():
@@ -82,9 +82,9 @@ def _for_single_precision(values: NDArray[Any], slope: float, intercept: float) 
 
 @contextmanager
 def read_at_random(arrays: Sequence[NDArray[Any]]) -> Iterator[None]:
-    """Of arrays that the system pages from a file, it reads single pages meanwhile, as rays ask for them.
+    """While this lasts, the system reads single pages of arrays that are paged from a file, as rays need them.
 
-    Otherwise it reads some megabytes around each page, which it has to drop again where memory is scarce.
+    Otherwise it reads some megabytes around each page, and has to drop them again if memory is scarce.
     """
     files = [file for file in map(_paged_from, arrays) if file is not None and hasattr(file, "madvise")]
     for file in files:

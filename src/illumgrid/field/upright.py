@@ -1,4 +1,4 @@
-"""Which way is up: signed axes of the array, for cameras and skies."""
+"""The up direction: signed axes of the array, for cameras and skies."""
 
 import numpy as np
 
@@ -37,11 +37,11 @@ BLUNT = 12.0  # over the number of sections: the share that the second one of a 
 
 
 def up_of(scene: Scene) -> str:
-    """The default up: world +z, or -z for an object that would stand on its head.
+    """The default up direction: world +z, or -z for an object that is stored upside down.
 
     Only an array without orientation (`Volume.oriented`: its file states none) in a scene without walls is turned over,
-    and only if the object, as Otsu's threshold finds it, ends in a flat cut on top and is rounded below: a bust stands
-    on its neck.
+    and only if the object, found by Otsu's threshold, ends in a flat cut on top and is rounded below, like a bust that
+    stands on its head.
     """
     first = scene.fields[0]
     if first.volume.oriented or scene.quads or len(scene.fields) > 1:

@@ -19,7 +19,7 @@ Floats = NDArray[np.float64]
 Side = Literal["above", "below"]
 
 UPWARD: dict[Side, float] = {"above": 1.0, "below": -1.0}
-"""The sign with which a field's solid is where values are high: the solid of c is {UPWARD h >= UPWARD c}."""
+"""Sign with which the solid is where values are high: the solid of c is {UPWARD h >= UPWARD c}."""
 
 
 class Lattice(Protocol):
@@ -81,11 +81,11 @@ def states_place(origin: Floats, direction: Floats) -> bool:
 
 
 AT_ONCE = 1 << 22
-"""Voxels that are looked at together: bounds the memory."""
+"""Voxels that are examined together: bounds the memory."""
 
 
 def slabs(shape: tuple[int, ...], most: int = AT_ONCE) -> Iterator[slice]:
-    """Slices of the first axis, each of about `most` voxels, that together are the whole array."""
+    """Slices of the first axis, each of about `most` voxels, that together cover the whole array."""
     rows = max(1, most // max(1, int(np.prod(shape[1:]))))
     for first in range(0, shape[0], rows):
         yield slice(first, min(first + rows, shape[0]))
@@ -95,10 +95,10 @@ def slabs(shape: tuple[int, ...], most: int = AT_ONCE) -> Iterator[slice]:
 class Volume:
     """A scalar field h = slope · stored + intercept, sampled at voxel centres, compared by identity.
 
-    Values of 8 or 16 bits and of single precision are stored as they come, without a copy where they lie in C order
-    and are h; where slope and intercept are whole numbers and h fits into as many bits, h is stored. Values of other
-    types are stored in single precision. Where that would cost h more than 1e-5 of its span (a large offset), or
-    where h is beyond the numbers of single precision, they are mapped onto about -1 to 1; slope and intercept undo it.
+    Values of 8 or 16 bits and of single precision are stored as given, without a copy if they are in C order and equal
+    h. If slope and intercept are whole numbers and h fits into as many bits, h is stored. Values of other types are
+    stored in single precision. If rounding would then cost more than 1e-5 of the span of h (a large offset), or if h is
+    beyond the range of single precision, values are mapped onto about -1 to 1; slope and intercept undo that.
 
     Parameters
     ----------
@@ -111,24 +111,24 @@ class Volume:
     direction : (3, 3) array_like
         Columns are the world directions of the axes, orthonormal; a determinant of -1 mirrors.
     slope, intercept : float
-        What turns the values given into h, in whose units all isovalues are.
+        h = slope · values + intercept. All isovalues are in the units of h.
     unit : str, optional
         Of the world coordinates, such as "mm" or "µm".
     stored : array_like, optional
-        In place of `values`, and the same: so that ``dataclasses.replace`` can change the rest.
+        Used by ``dataclasses.replace`` in place of `values`.
     oriented : bool, optional
-        Whether origin and direction say which way is up; by default, unless both are those of a file that states none:
-        identity axes at the world's origin. A part of such a file lies elsewhere and is no better oriented.
+        Whether origin and direction determine which way is up. By default False if both are those of a file without
+        orientation: identity axes at the world's origin. A part of such a file has another origin, but no orientation.
 
     Attributes
     ----------
     values : (nx, ny, nz) array
-        h at the voxel centres, read-only: what is stored where the slope is 1 and the intercept 0; otherwise computed
-        each time it is asked for, in double precision.
+        h at the voxel centres, read-only: the stored array if the slope is 1 and the intercept 0, otherwise computed on
+        each access, in double precision.
     stored : (nx, ny, nz) array
-        What is kept, of one of the types `storing.NATIVE`, C order, read-only.
+        The array that is kept, of one of the types `storing.NATIVE`, in C order, read-only.
     slope, intercept : float
-        What turns what is stored into h; the slope is positive.
+        h = slope · stored + intercept; the slope is positive.
 
     Raises
     ------
@@ -189,7 +189,7 @@ class Volume:
 
     @property
     def values(self) -> NDArray[Any]:
-        """The field h at the voxel centres, (nx, ny, nz), read-only: stored, or computed each time it is asked for."""
+        """The field h at the voxel centres, (nx, ny, nz), read-only: the stored array, or computed on each access."""
         if self.plain:
             return self.stored
         values = np.empty(self.shape)
@@ -200,7 +200,7 @@ class Volume:
 
     @property
     def plain(self) -> bool:
-        """Whether what is stored is h."""
+        """Whether the stored values are h."""
         return self.slope == 1 and self.intercept == 0
 
     @property
@@ -211,7 +211,7 @@ class Volume:
 
     @cached_property
     def gaps(self) -> int:
-        """How many voxels are not finite."""
+        """Number of voxels that are not finite."""
         if self.stored.dtype.kind != "f":
             return 0
         return int(sum(np.count_nonzero(~np.isfinite(self.stored[slab])) for slab in slabs(self.shape)))
@@ -227,7 +227,7 @@ class Volume:
 
     @cached_property
     def tally(self) -> tuple[NDArray[Any], NDArray[np.int64]]:
-        """Stored values of 8 or 16 bits that occur, and how often each does."""
+        """Stored values of 8 or 16 bits that occur, and the number of voxels with each."""
         width, counts = self.stored.itemsize, np.zeros(1 << 8 * self.stored.itemsize, np.int64)
         for slab in slabs(self.shape):
             counts += np.bincount(self.stored[slab].reshape(-1).view(f"u{width}"), minlength=len(counts))
@@ -244,11 +244,11 @@ class Volume:
             return float(self.in_units(low)), float(self.in_units(high))
 
     def in_units(self, stored: ArrayLike) -> Floats:
-        """What h is where the stored values are these."""
+        """Values of h for these stored values."""
         return np.asarray(stored) if self.plain else np.asarray(stored, float) * self.slope + self.intercept
 
     def to_stored(self, isovalues: ArrayLike) -> Floats:
-        """The stored values, in double precision, where h is these isovalues."""
+        """Stored values, in double precision, for these isovalues of h."""
         here = np.asarray(isovalues)
         return here if self.plain else (np.asarray(here, float) - self.intercept) / self.slope
 
@@ -259,7 +259,7 @@ class Volume:
         )
 
     def with_stored(self, stored: NDArray[Any]) -> "Volume":
-        """Other stored values on the same lattice, with the same map."""
+        """Other stored values on the same lattice, with the same slope and intercept."""
         return replace(self, stored=stored)
 
 
@@ -268,15 +268,15 @@ def histogram(volume: Volume, bins: int, ends: tuple[float, float] | None = None
     # np.float64, not float: for float32 values NumPy would compute the edges in float32, too coarse far from 0.
     low, high = (np.float64(x) for x in (volume.stored_extremes if ends is None else ends))
     if volume.stored.dtype.kind == "f":
-        return np.histogram(volume.stored, bins, (low, high))  # it leaves out what is not finite
-    values, counts = volume.tally  # many times faster than to look at every voxel
+        return np.histogram(volume.stored, bins, (low, high))  # NumPy leaves out values that are not finite
+    values, counts = volume.tally  # many times faster than a pass over all voxels
     _, edges = np.histogram(values[:0], bins, (low, high))
     found, _ = np.histogram(values, bins, (low, high), weights=counts)
     return found.astype(np.int64), edges
 
 
 class Shaped(Protocol):
-    """Points on three axes: a `Lattice`, or an array (nx, ny, nz)."""
+    """Anything with a shape (nx, ny, nz): a `Lattice` or an array."""
 
     @property
     def shape(self) -> tuple[int, ...]:

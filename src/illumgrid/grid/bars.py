@@ -1,4 +1,4 @@
-"""Error bars of a lookup: what a straight line between nodes leaves out, from the second differences of the light."""
+"""Error bars of a lookup: the error of linear interpolation between nodes, from second differences of the light."""
 
 from collections.abc import Iterator
 
@@ -14,16 +14,16 @@ _AT_ONCE = 256  # blocks
 
 
 def alone(error: Array, support: Array) -> NDArray[np.bool_]:
-    """Nodes that rest on one sample, which no other node has, and holes."""
+    """Holes, and nodes that depend on a single sample that no other node uses."""
     return (support <= 1) | ~np.isfinite(error)
 
 
 def bend(light: Array, error: Array, lone: NDArray[np.bool_], axis: int, step: int) -> Floats:
-    """Mean square over RGB of second differences along an axis of blocks, `step` nodes apart, less their noise."""
+    """Mean square over RGB of second differences along an axis of blocks, `step` nodes apart, minus their noise."""
     along, bars = (np.moveaxis(a, axis + 1, 0) for a in (light, error))
     after, here, before = slice(2 * step, None), slice(step, -step), slice(None, -2 * step)
     square = np.square(along[after] - 2 * along[here] + along[before], dtype=float).mean(axis=-1)
-    # Infinite at holes. Noise that neighbours share, as they rest on the same samples, cancels in the differences.
+    # Infinite at holes. Noise that neighbours share, since they use the same samples, cancels in the differences.
     noise = np.where(np.moveaxis(lone, axis + 1, 0), np.square(bars, dtype=float), 0.0)
     return np.moveaxis(square - (noise[after] + 4 * noise[here] + noise[before]), 0, axis + 1)
 
@@ -47,7 +47,7 @@ def of_blocks(layout: Layout, light: Array, error: Array, support: Array, channe
 
 
 def _level_by_level(layout: Layout) -> Iterator[tuple[slice, Layout | None]]:
-    """Some blocks of one step at a time, the coarsest first, and all blocks that are coarser."""
+    """Yield the blocks of each step, the coarsest first, with all blocks that are coarser."""
     for step in sorted(set(layout.step.tolist()), reverse=True):
         these = np.flatnonzero(layout.step == step)
         first, last = int(these[0]), int(these[-1]) + 1
@@ -59,10 +59,10 @@ def _level_by_level(layout: Layout) -> Iterator[tuple[slice, Layout | None]]:
 
 
 def _of_lattice(light: Array, error: Array, support: Array) -> list[Floats]:
-    """Bends along each axis at the nodes of one block, next to its border those at the border."""
+    """Second differences along each axis at the nodes of one block; a border node has those of its neighbour."""
     lone, found = alone(error, support), []
     for axis in range(3):
-        if error.shape[axis + 1] > 2:  # two nodes show no curvature
+        if error.shape[axis + 1] > 2:  # two nodes have no second difference
             edges = [(1, 1) if a == axis + 1 else (0, 0) for a in range(4)]
             found.append(np.pad(_known(bend(light, error, lone, axis, 1)), edges, mode="edge"))
     return found
@@ -71,7 +71,7 @@ def _of_lattice(light: Array, error: Array, support: Array) -> list[Floats]:
 def _of_rimmed(
     layout: Layout, some: slice, channels: Channels, light: Array, error: Array, support: Array
 ) -> list[Floats]:
-    """Bends along each axis at the nodes of some blocks of one step, from those and what is read around them."""
+    """Second differences along each axis at the nodes of some blocks of one step, with the values read around them."""
     index, (bx, by, bz) = layout.place(some, 1), layout.side + 3
     parts = answer(layout, light, error, support, index)
     shown = channels.shown(parts[0]).reshape(len(index), bx, by, bz, -1)
@@ -85,7 +85,7 @@ def _of_rimmed(
         inner[0], inner[axis + 1] = slice(None), slice(None)
         each = _known(bend(shown, bars, lone, axis, 1))[tuple(inner)]
         at = layout.corner[some, axis][:, None] + np.arange(each.shape[axis + 1]) * step
-        # At the border of the lattice that of the next node, as nothing is beyond.
+        # At the border of the lattice, use the next node, since nothing lies beyond.
         toward = np.where(at == 0, 1, np.where(at >= last, -1, 0)) + np.arange(at.shape[1])
         toward = np.clip(toward, 0, at.shape[1] - 1)
         shape = [len(at), 1, 1, 1]
@@ -95,7 +95,7 @@ def _of_rimmed(
 
 
 def _known(bends: Floats) -> Floats:
-    """Next to a hole only the other axes count."""
+    """Next to a hole, count only the other axes."""
     return np.maximum(np.nan_to_num(bends, neginf=0.0), 0.0)
 
 

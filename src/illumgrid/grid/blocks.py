@@ -1,4 +1,4 @@
-"""Nodes of a lattice in blocks of equal shape: only those that are read, each block at a density of its own.
+"""Nodes of a lattice in blocks of equal shape: only those that are read, each block with its own node spacing.
 
 A block holds the nodes on its border, too, so that a lookup reads one block. A lattice whose nodes are all held is one
 block. M. J. Berger and P. Colella, "Local adaptive mesh refinement for shock hydrodynamics", Journal of Computational
@@ -19,13 +19,13 @@ SIDE = 8
 
 
 class Layout(NamedTuple):
-    """Where blocks lie in the finest lattice, whose nodes all numbers count: see `laid_out`."""
+    """Where blocks lie in the finest lattice, in whose nodes all numbers count: see `laid_out`."""
 
     shape: NDArray[np.int64]  # (3,) nodes of the finest lattice
     side: NDArray[np.int64]  # (3,) cells of a block along each axis
     corner: NDArray[np.int64]  # (n, 3) first node of each block
     step: NDArray[np.int64]  # (n,) from one of its nodes to the next, a power of two; the coarsest blocks come first
-    slot: NDArray[np.int64]  # of boxes of `side` finest cells: the block that is read there, ~ of the nearest if none
+    slot: NDArray[np.int64]  # per box of `side` finest cells: the block that is read there, or ~ of the nearest
 
     def __len__(self) -> int:
         return len(self.step)
@@ -36,7 +36,7 @@ class Layout(NamedTuple):
         return len(self.step) == 1 and bool((self.side + 1 == self.shape).all())
 
     def place(self, blocks: NDArray[np.integer] | slice, rim: int = 0) -> NDArray[np.int64]:
-        """Indices (m, n, 3) of the nodes of some blocks, those of a rim so wide around each as well."""
+        """Indices (m, n, 3) of the nodes of some blocks, with a rim of so many nodes around each."""
         local = np.moveaxis(np.indices(tuple(self.side + 1 + 2 * rim)), 0, -1).reshape(-1, 3) - rim
         return np.asarray(self.corner[blocks][:, None] + local * self.step[blocks][:, None, None])
 
@@ -62,7 +62,7 @@ def laid_out(shape: ArrayLike, corner: NDArray[np.integer], step: NDArray[np.int
 
     nodes, sides = np.array(shape, np.int64), np.full(3, side, np.int64)
     slot = np.full(-(-(nodes - 1) // side), -1, np.int64)
-    if not len(step):  # there is always something to read
+    if not len(step):  # at least one block, so that there is something to read
         corner, step = np.zeros((1, 3), np.int64), np.ones(1, np.int64)
     for size in sorted(set(step.tolist()), reverse=True):
         these = np.flatnonzero(step == size)
@@ -77,7 +77,7 @@ def laid_out(shape: ArrayLike, corner: NDArray[np.integer], step: NDArray[np.int
 
 
 def boxes(index: NDArray[np.integer], shape: ArrayLike, step: int, side: int = SIDE) -> NDArray[np.int64]:
-    """Corners (n, 3) of the blocks of a step that hold a node (m, 3), in order; a node on a border has several."""
+    """Corners (n, 3) of the blocks of a step that contain a node (m, 3), in order; a node on a border is in several."""
     size, most = side * step, (np.array(shape) - 2) // (side * step)
     counts = most + 1
     marked = np.zeros(counts, bool)
@@ -87,7 +87,7 @@ def boxes(index: NDArray[np.integer], shape: ArrayLike, step: int, side: int = S
 
 
 def in_cells(shape: ArrayLike, cells: NDArray[np.bool_], step: int, side: int = SIDE) -> Layout:
-    """Blocks of one step that hold the marked cells of the lattice of every `step`-th node."""
+    """Blocks of one step that contain the marked cells of the lattice of every `step`-th node."""
     ends = -np.array(cells.shape) % side
     padded = np.pad(cells, [(0, end) for end in ends])
     many = np.array(padded.shape) // side
@@ -116,7 +116,7 @@ def put(
 
 
 def beside_coarser(layout: Layout, index: NDArray[np.integer], step: int) -> NDArray[np.bool_]:
-    """Which nodes (n, 3) of blocks of this step a coarser block holds as well: there it says what is read."""
+    """Which nodes (n, 3) of blocks of this step are also in a coarser block, which then determines their values."""
     side, found = layout.side, np.zeros(len(index), bool)
     border = np.flatnonzero((index % (side * step) == 0).any(axis=1))
     node, most = np.minimum(index[border], layout.shape - 1), np.array(layout.slot.shape) - 1
@@ -143,8 +143,8 @@ def answer(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:  # fmt: skip
     """Light (n, C), error (n,) and support (n,) at fractional indices (n, 3) from those of blocks.
 
-    The error is the weighted mean of the nodes that are mixed, which holds however their errors are correlated, and
-    infinite where one has none; the support is the smallest. In no block there is no error and no support.
+    The error is the weighted mean of the eight nodes' errors, an upper bound for any correlation, and infinite if one
+    is unknown; the support is the smallest. Outside all blocks the error is infinite and the support 0.
     """
     from illumgrid.grid.trilinear import answer
 
@@ -159,7 +159,7 @@ def answer(
 
 
 def fixed(values: NDArray[np.float32]) -> NDArray[np.float32]:
-    """The same, not to be written to: always, else Numba compiles again, for another type."""
+    """The same, read-only in every case; otherwise Numba compiles again for another type."""
     view = np.ascontiguousarray(values, np.float32).view()
     view.flags.writeable = False
     return view

@@ -1,4 +1,4 @@
-"""Grids and walls as a cache: where a path that meets a surface may end, and take the light that is known there.
+"""Grids and walls as a cache: paths that meet a surface may end there and take the stored light.
 
 G. J. Ward, F. M. Rubinstein and R. D. Clear, "A ray tracing solution for diffuse interreflection", SIGGRAPH 1988;
 J. Křivánek and P. Gautron, "Practical Global Illumination with Irradiance Caching", 2009.
@@ -18,7 +18,7 @@ from illumgrid.grid.illumination import IlluminationGrid
 from illumgrid.grid.walls import WallTexture
 
 ALIKE = 0.3
-"""Spread of a cell's nodes, largest less smallest, over the mean light of the grid, above which paths go on."""
+"""Range of a cell's nodes, relative to the mean light of the grid, above which paths continue."""
 
 
 class Cache(NamedTuple):
@@ -34,7 +34,7 @@ class Cache(NamedTuple):
     origin: Floats  # (F, 3) frame position of node 0
     spacing: Floats  # (F, 3)
     near: Floats  # (F + Q,) distance below which a ray is too short to end: neighbours would light themselves
-    sweep: Floats  # (F, 2) levels at the two ends of the sweep, turned and as stored
+    sweep: Floats  # (F, 2) levels at the two ends of the sweep, as stored and with the sign of the solid
     after: int = 0  # reflections before a path may end
 
 
@@ -42,7 +42,7 @@ NO_CACHE = Cache(
     np.zeros((0, 1), np.float32), np.zeros(0, bool), np.zeros(0, np.int64), np.zeros((0, 3), np.int64),
     np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros((0, 2)),
 )  # fmt: skip
-"""With it every path goes on to its end."""
+"""A cache with which every path continues to its end."""
 NO_CACHE.light.flags.writeable = False
 
 
@@ -64,7 +64,7 @@ def cache_of(
     alike : float
         Infinite to trust all cells without holes.
     after : int
-        Reflections before a path may end: each weakens what the cache is off.
+        Reflections before a path may end; each reduces the influence of the cache's error.
 
     Raises
     ------
@@ -107,7 +107,7 @@ def cache_of(
 
 
 def _alike(light: NDArray[np.float32], lit: NDArray[np.bool_], alike: float) -> NDArray[np.bool_]:
-    """Cells (nx, ny, nz), named by their lowest node, whose nodes all have light, and much the same."""
+    """Cells (nx, ny, nz), named by their lowest node, whose nodes all have similar light of their own."""
     mean = float(light[lit].mean(dtype=float)) if lit.any() else 0.0
     found = np.empty(light.shape, bool)
     for some in slabs(light.shape):

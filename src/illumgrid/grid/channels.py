@@ -1,4 +1,4 @@
-"""Channels of light: light is linear, so grids and samples carry as many as a scene needs, and mix them to RGB."""
+"""Channels of light: since light is linear, grids and samples carry one per light, and mix them to RGB."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -23,7 +23,7 @@ class Channels:
     names : tuple of str
         C names, those of the channels in an EXR file.
     mix : tuple of (float, float, float)
-        What each channel adds to red, green and blue, C rows.
+        C rows: the contribution of each channel to red, green and blue.
     """
 
     names: tuple[str, ...]
@@ -34,7 +34,7 @@ class Channels:
 
     @cached_property
     def own(self) -> int:
-        """How many of the first channels are what is shown, as they are: 1 if that is grey, 3 for RGB, 0 if none."""
+        """Number of the first channels that are shown unchanged: 1 for grey, 3 for RGB, 0 if the mix is another."""
         for few in (GREY_MIX, RGB_MIX):
             if self.mix[: len(few)] == few and not any(map(any, self.mix[len(few) :])):
                 return len(few)
@@ -42,7 +42,7 @@ class Channels:
 
     @property
     def mixable(self) -> bool:
-        """Whether there are lights to weigh against each other, each with its own error.
+        """Whether there are several lights whose weights can be changed, each with its own error.
 
         Basis functions are too many, and no weighted sum of their errors would say much.
         """
@@ -50,14 +50,14 @@ class Channels:
 
     @property
     def grey(self) -> bool:
-        """Whether what is shown has no colour."""
+        """Whether the light that is shown is grey."""
         return self.own == 1
 
     def shown(self, light: NDArray[np.float32]) -> NDArray[np.float32]:
-        """What is shown of light (..., C): grey (..., 1) or linear RGB (..., 3); a view where it is stored so."""
+        """The shown mix of light (..., C): grey (..., 1) or linear RGB (..., 3); a view if it is stored so."""
         if self.own:
             return light if self.own == len(self) else light[..., : self.own]
-        # Layers may be negative, and some weights too: only their sum is light.
+        # Layers and weights may be negative; only their sum is light.
         return np.maximum(light @ np.array(self.mix, dtype=np.float32), np.float32(0))
 
     def rgb(self, light: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -73,7 +73,7 @@ GREY = Channels(("Y",), GREY_MIX)
 
 
 def columns_of(scene: Scene) -> list[Channel]:
-    """What the channels of a scene see: all light together, then each of several layers."""
+    """The columns for the channels of a scene: all light together, then each of several layers."""
     grey = all(map(is_grey, colors_of(scene)))
     layers = layers_of(scene)
     together = [Channel(None, color) for color in range(1 if grey else 3)]
@@ -83,7 +83,7 @@ def columns_of(scene: Scene) -> list[Channel]:
 def channels_of(scene: Scene) -> Channels:
     """The light of the scene as it is, GREY where nothing has a colour, else RGB; then each of several layers.
 
-    What is shown is the light of the scene as it is; the layers wait for another mix: see `mixed`.
+    The light of the scene as it is is shown; the layers are for other mixes: see `mixed`.
     """
     columns = columns_of(scene)
     together = [column for column in columns if column.layer is None]
@@ -101,14 +101,14 @@ def mixed(channels: Channels, layers: Sequence[Layer], weights: Mapping[str, flo
     channels : Channels
         As `channels_of` made them.
     layers : sequence of Layer
-        Those of the scene; of a sky in spherical harmonics with the coefficients of another sky, perhaps.
+        Those of the scene; for a sky in spherical harmonics, possibly with the coefficients of another sky.
     weights : mapping
         From the name of a layer to a number.
 
     Raises
     ------
     BadInput
-        If the channels are the sum of several layers alone, as those of a backend that knows RGB only.
+        If the channels hold only the sum of several layers, as those of a backend that computes RGB only.
     """
     known, rows = {layer.name: layer for layer in layers}, []
     if len(layers) > 1 and not any("." in name for name in channels.names):
@@ -121,7 +121,7 @@ def mixed(channels: Channels, layers: Sequence[Layer], weights: Mapping[str, flo
         only = np.array(GREY_MIX[0] if color == "Y" else RGB_MIX["RGB".index(color)])
         if layer:
             rows.append(weights.get(layer, 1.0) * np.array(known[layer].color) * only)
-        else:  # all light together is part of a mix only where it is one layer
+        else:  # all light together is part of a mix only if there is one layer
             rows.append(only * (weights.get(layers[0].name, 1.0) if len(layers) == 1 else 0.0))
     return Channels(channels.names, tuple((float(r), float(g), float(b)) for r, g, b in rows))
 
@@ -143,7 +143,7 @@ def stored(light: ArrayLike, channels: Channels | None = None) -> dict[str, Any]
     """
     array = np.asarray(light, dtype=np.float32)
     if channels == GREY and array.shape[-1] == 3 and array.strides[-1] == 0:
-        array = array[..., :1]  # the RGB view of grey light, as dataclasses.replace hands it on
+        array = array[..., :1]  # grey light as RGB, passed on by dataclasses.replace
     channels = channels_for(array.shape[-1]) if channels is None else channels
     count = array.shape[-1]
     if len(channels) != count:

@@ -19,16 +19,16 @@ _BLOCK = 1 << 18  # nodes
 
 
 class Block(NamedTuple):
-    """Some nodes of a grid, one after the other, and what they hold."""
+    """Some consecutive nodes of a grid, and their light."""
 
-    nodes: slice  # of the flat C-order numbers
+    nodes: slice  # flat C-order numbers
     values: NDArray[np.float32]  # (m, 3)
     error: NDArray[np.float32]  # (m,)
     support: NDArray[np.float32]  # (m,)
 
 
 class Held(NamedTuple):
-    """What a grid holds, in blocks of nodes: see `illumgrid.grid.blocks`."""
+    """The content of a grid, in blocks of nodes: see `illumgrid.grid.blocks`."""
 
     layout: Layout
     light: NDArray[np.float32]  # (blocks, i, j, k, C)
@@ -38,7 +38,7 @@ class Held(NamedTuple):
 
     @property
     def size(self) -> int:
-        """Nodes, those on borders of several blocks counted in each."""
+        """Number of nodes; a node on the border of several blocks is counted in each."""
         return self.support.size
 
 
@@ -55,17 +55,17 @@ class IlluminationGrid:
     error : (nx, ny, nz) float32
         Standard error of the node, root mean square over RGB; infinite without support.
     support : (nx, ny, nz) float32
-        Number of samples that the node rests upon; 0 marks a hole.
+        Number of samples from which the node was computed; 0 marks a hole.
     channels : Channels, optional
         By default grey for one channel, RGB for three.
     errors : (nx, ny, nz, C) float32, optional
         Standard error of each channel, for the error of another mix of several layers.
     rows : tuple of IlluminationGrid, optional
-        Of a field whose level is held: the same at equal steps of the sweep of the other fields. The arrays of the grid
-        itself are those in its middle.
+        Only for a field whose level is held: one grid for each of some equal steps of the sweep of the other fields.
+        The arrays of this grid itself are those at the middle of the sweep.
     held : Held, optional
-        In place of the arrays: nodes in blocks, `spec` being the lattice of the finest. The arrays are then made when
-        they are asked for, with what a lookup answers at nodes that no block holds; `lookup` and its like need none.
+        Instead of the arrays: nodes in blocks, where `spec` is the finest lattice. The arrays are then made on first
+        use, with the result of a lookup at nodes that no block holds; `lookup` and similar methods do not need them.
 
     Attributes
     ----------
@@ -85,7 +85,7 @@ class IlluminationGrid:
     ) -> None:  # fmt: skip
         if held is None or not (values is None and error is None and support is None):
             before = None if held is None else IlluminationGrid(spec, channels=channels, held=held)
-            if before is not None:  # as `replace` hands on what is not replaced
+            if before is not None:  # so that `replace` can pass on what it does not replace
                 errors = before.errors if values is None and errors is None else errors
                 values = before.light if values is None else values
                 error = before.error if error is None else error
@@ -116,7 +116,7 @@ class IlluminationGrid:
             yield slice(first, min(first + _BLOCK, count))
 
     def lattice(self) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-        """Light (nx, ny, nz, C) of all nodes, and which have light: from blocks both are made anew, and not kept."""
+        """Light (nx, ny, nz, C) of all nodes, and which have light; from blocks, both are made on each access."""
         held, shape = self.held, tuple(self.spec.shape)
         if held.layout.dense:
             return held.light[0], held.support[0] > 0
@@ -143,12 +143,12 @@ class IlluminationGrid:
 
     @property
     def support(self) -> NDArray[np.float32]:
-        """Samples (nx, ny, nz) behind all nodes."""
+        """Number of samples (nx, ny, nz) behind all nodes."""
         return self._arrays[2]
 
     @cached_property
     def values(self) -> NDArray[np.float32]:
-        """Irradiance (nx, ny, nz, 3), linear RGB; no copy where that is what is stored."""
+        """Irradiance (nx, ny, nz, 3), linear RGB; no copy if it is stored in this form."""
         rgb = self.channels.rgb(self.light).view()
         rgb.flags.writeable = False
         return rgb
@@ -173,7 +173,7 @@ class IlluminationGrid:
         held = self.held
         error = np.full(held.error.shape, np.inf, np.float32)
         if held.errors is not None:
-            known = np.isfinite(held.errors)  # infinite times 0 is no number
+            known = np.isfinite(held.errors)  # infinity times 0 is NaN
             bound = np.where(known, held.errors, np.float32(0)) @ np.abs(np.array(channels.mix, np.float32))
             error = np.where(known.all(axis=-1), np.sqrt(np.square(bound).mean(axis=-1)), np.inf).astype(np.float32)
         rows = tuple(row.showing(channels) for row in self.rows)
@@ -189,7 +189,7 @@ class IlluminationGrid:
         ----------
         points : (n, 3) array_like
         t : float
-            Place in the sweep, 0 to 1, of the fields beside one whose level is held; without meaning for others.
+            Position of the other fields in the sweep, 0 to 1, for a field whose level is held; ignored otherwise.
         """
         if self.rows:
             place = float(np.clip(t, 0.0, 1.0)) * (len(self.rows) - 1)
@@ -207,8 +207,8 @@ class IlluminationGrid:
     def certainty(self, points: ArrayLike) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Error and support (n,) of the up to eight nodes that `lookup` mixes at world points (n, 3).
 
-        The error is their weighted mean, which holds however the nodes' errors are correlated, and infinite where one
-        has none; the support is the smallest.
+        The error is their weighted mean, an upper bound for any correlation of the nodes' errors, and infinite if one
+        is unknown; the support is the smallest.
         """
         held = self.held
         return answer(held.layout, held.light[..., :0], held.error, held.support, world_to_index(self.spec, points))[1:]
@@ -227,7 +227,7 @@ class IlluminationGrid:
         return self.values, self.error, self.support
 
     def onto(self, spec: GridSpec) -> "IlluminationGrid":
-        """Grid on another lattice: light as `lookup` reads it, error and support those of the nearest node."""
+        """Resample the grid on another lattice: light as `lookup` reads it, error and support of the nearest node."""
         held, count = self.held, int(np.prod(spec.shape))
         each = held.light[..., :0] if held.errors is None else held.errors
         light, errors = (np.empty((count, of.shape[4]), np.float32) for of in (held.light, each))
@@ -245,7 +245,7 @@ class IlluminationGrid:
 
     @property
     def dark(self) -> NDArray[np.bool_]:
-        """Which nodes (nx, ny, nz) are held and have no light of their own."""
+        """Which nodes (nx, ny, nz) are stored but have no light of their own."""
         held, shape = self.held, self.spec.shape
         if held.layout.dense:
             return np.asarray(held.support[0] == 0)
@@ -259,7 +259,7 @@ class IlluminationGrid:
 
     @cached_property
     def _even(self) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-        """Light (m, C), error (m,) and support (m,) at places that lie evenly: the nodes of the coarsest blocks."""
+        """Light (m, C), error (m,) and support (m,) at evenly spaced places: the nodes of the coarsest blocks."""
         held, shape = self.held, self.spec.shape
         layout = held.layout
         if layout.dense:
@@ -271,11 +271,11 @@ class IlluminationGrid:
 
     @property
     def lit(self) -> NDArray[np.float32]:
-        """Irradiance (m, 3) of the nodes that have light of their own; of the coarsest of several densities alone."""
+        """Irradiance (m, 3) of the nodes that have light of their own; of several densities only the coarsest."""
         return np.concatenate(list(self.lit_parts()))
 
     def lit_parts(self) -> Iterator[NDArray[np.float32]]:
-        """Yield `lit`, some at a time."""
+        """Yield `lit` in parts."""
         light, _, support = self._even
         for first in range(0, len(light), _BLOCK):
             some = slice(first, first + _BLOCK)
@@ -289,7 +289,7 @@ class IlluminationGrid:
 
     @cached_property
     def relative_error(self) -> float | None:
-        """Root mean square standard error of the nodes over their mean irradiance; None where none is known."""
+        """Root mean square standard error of the nodes over their mean irradiance; None if no error is known."""
         light, error, support = self._even
         known = np.isfinite(error) & (support > 0)
         mean = float(self.channels.rgb(light[known]).mean()) if known.any() else 0.0
@@ -305,10 +305,11 @@ class IlluminationGrid:
     def bar(self) -> NDArray[np.float32]:
         """Standard error (nx, ny, nz) of a lookup near each node: noise and interpolation; infinite without support.
 
-        Noise: of the variance of nodes with a sample each a trilinear lookup keeps Σ w² of its weights w, 8/27 in the
-        mean over a cell; nodes that rest on several samples share them with their neighbours, and it keeps all.
-        Interpolation: between nodes a straight line is off by at most an eighth of the second difference (h²/8 times
-        the largest second derivative), which is taken along each axis from the values themselves, less their noise.
+        Noise: if each node has a sample of its own, a trilinear lookup with weights w keeps the share Σ w² of their
+        variance, 8/27 in the mean over a cell; nodes computed from several samples share these with their neighbours,
+        and the lookup keeps all of the variance. Interpolation: the error of linear interpolation is at most an eighth
+        of the second difference (h²/8 times the largest second derivative), which is measured along each axis from the
+        values, with their noise subtracted.
         """
         if self.held.layout.dense:
             return np.asarray(self.bars[0])
@@ -317,9 +318,9 @@ class IlluminationGrid:
 
     @cached_property
     def resolution(self) -> float:
-        """Second differences over twice the distance, over those from node to node: 4 on light that is well resolved.
+        """Second differences over two node spacings, relative to those over one: 4 where the light is well resolved.
 
-        Near 1 the light changes from node to node without a law, and `bar` is a lower bound. Infinite without bends.
+        Near 1 the light varies irregularly from node to node, and `bar` is a lower bound. Infinite without curvature.
         """
         layout, light, error, support, _ = self.held
         return resolution(layout, light, error, support, self.channels)
@@ -334,7 +335,7 @@ def _dense(
     spec: GridSpec, values: Any, error: Any, support: Any, channels: Channels | None,
     errors: NDArray[np.float32] | None,
 ) -> tuple[Held, Channels]:  # fmt: skip
-    """Arrays of all nodes as one block."""
+    """The arrays of all nodes as one block."""
     shape = tuple(spec.shape)
     if np.shape(values)[:-1] != shape:
         expected = f"{(*shape, 3)} (RGB), {(*shape, 1)} (grey) or as many channels as are named"

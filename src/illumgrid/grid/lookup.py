@@ -1,4 +1,4 @@
-"""Reading light between the nodes of a lattice, and filling nodes that have none of their own."""
+"""Reading light between the nodes of a lattice, and filling nodes without light of their own."""
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -24,7 +24,7 @@ def fill_holes(spacing: ArrayLike, values: NDArray[np.float32], support: NDArray
 
     nearest = distance_transform_edt(holes, sampling=np.asarray(spacing), return_distances=False, return_indices=True)
     filled = values if values.flags.writeable else values.copy()
-    for x in range(len(holes)):  # a slab at a time: what is read is light of nodes that are no holes
+    for x in range(len(holes)):  # slab by slab; only light of nodes that are not holes is read
         hole = holes[x]
         filled[x][hole] = filled[tuple(axis[x][hole] for axis in nearest)]
     return filled

@@ -1,4 +1,4 @@
-"""Lattices in each other: every second node of a fine one is a node of the next coarser one."""
+"""Nested lattices: every second node of a fine lattice is a node of the next coarser one."""
 
 from collections.abc import Sequence
 
@@ -18,7 +18,7 @@ def finer(spec: GridSpec, levels: int) -> GridSpec:
 
 
 def halvings(specs: Sequence[GridSpec]) -> int:
-    """How often the spacing of lattices is halved where light is rough: up to twice, 0 if they are too large."""
+    """How often the node spacing is halved where light is rough: up to twice, 0 if the lattices are too large."""
     return next((levels for levels in (2, 1) if (along_longest(specs) - 1) * 2**levels < FINEST), 0)
 
 
@@ -37,7 +37,7 @@ def all_corners(nodes: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def spread(grid: IlluminationGrid) -> NDArray[np.float32]:
-    """By how much (nx - 1, ny - 1, nz - 1) the light at the corners of each cell differs, those without light aside."""
+    """Range (nx - 1, ny - 1, nz - 1) of the light at the corners of each cell, without corners that have no light."""
     shown, dark = grid.channels.shown(grid.light).mean(axis=-1), grid.support == 0
     low, high = np.where(dark, np.float32(np.inf), shown), np.where(dark, np.float32(-np.inf), shown)
     for axis in range(3):

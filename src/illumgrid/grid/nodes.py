@@ -1,4 +1,4 @@
-"""The nodes that an interpolator fills: each knows its place, and the level set through itself."""
+"""The nodes that an interpolator fills: each has a position and the level set through it."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -30,7 +30,7 @@ def _crossed_cells(field: Field, rows: slice) -> NDArray[np.bool_]:
 
 
 def _overlapped(cells: int, grid_cells: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """The first and the last voxel cell along an axis that each grid cell overlaps."""
+    """The first and the last voxel cell along an axis that overlap each grid cell."""
     numbers = np.arange(grid_cells)
     return numbers * cells // grid_cells, -(-(numbers + 1) * cells // grid_cells) - 1
 
@@ -120,7 +120,7 @@ class Nodes:
     ) -> IlluminationGrid:
         """Grid of light (m, C), error (m,), support (m,) and `errors` at the nodes (m,) with these numbers.
 
-        The others are holes. The arrays are taken out of the list as they are spread, so that none is held twice.
+        All other nodes are holes. Arrays are removed from the list as they are spread, so that none is held twice.
         """
 
         def whole(which: int, empty: float) -> NDArray[np.float32] | None:
@@ -133,13 +133,13 @@ class Nodes:
 
         light, support = whole(0, 0.0), whole(2, 0.0)
         assert light is not None and support is not None
-        light = fill_holes(self.spec.spacing, light, support)  # takes more than the errors, which come after it
+        light = fill_holes(self.spec.spacing, light, support)  # needs the most memory, so first
         return IlluminationGrid(self.spec, light, whole(1, np.inf), support, channels, whole(3, np.inf))
 
 
 @dataclass(frozen=True, eq=False)
 class NodeBlock:
-    """Some nodes; what they know is computed when it is asked for.
+    """Some nodes; their properties are computed on access.
 
     Parameters
     ----------

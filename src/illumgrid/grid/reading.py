@@ -1,4 +1,4 @@
-"""Light read by place, level and normal, compiled: locally weighted regression over the samples near a point.
+"""The weights of `bilateral`, compiled: locally weighted regression over samples by position, level and normal.
 
 Serial, no state, the GIL released; threads are the caller's. Index coordinates u count spacings of the lattice that was
 lit, x voxels. The constants are in spacings or pure numbers, so that the result does not depend on units.
@@ -13,13 +13,13 @@ inlined = njit(_nrt=False, forceinline=True)
 
 LEVEL = 0.2  # node spacings between level sets, one standard deviation of the weight
 TURN = 0.2  # of 1 - n·n': the weight falls to 1/e there, at 37 degrees, and to e^-10 for opposite normals
-RIDGE = 0.1  # of the weights' sum, in squared spacings: what holds back slopes that the samples do not tell
-NEGLIGIBLE = 14.0  # a weight e^-14 of the largest is none
-NEAREST = 0.499  # spacings within which a hole of the lit lattice makes a hole; halfway the others decide
-REACH = 2.0 - 1e-4  # spacings along each axis from which on a sample has no weight
-STEPS, HOLD = 4, 0.5  # voxels along each axis: how often, and how far, a node beyond the range moves towards it
+RIDGE = 0.1  # ridge for slopes that the samples do not determine: times the weights' sum, in squared spacings
+NEGLIGIBLE = 14.0  # weights below e^-14 of the largest are dropped
+NEAREST = 0.499  # spacings within which a hole of the lit lattice makes a hole; from half a spacing the others count
+REACH = 2.0 - 1e-4  # spacings along each axis beyond which a sample has no weight
+STEPS, HOLD = 4, 0.5  # steps of a node beyond the range towards the range, and voxels along each axis that it may move
 MOVED = STEPS * HOLD
-MOST = 512  # samples that one point reads, at most
+MOST = 512  # samples that one point uses, at most
 
 
 @inlined
@@ -79,7 +79,7 @@ def hat(d):
 
 @inlined
 def first_from(keys, low, high, least):
-    """The first place from `low` up to `high` where ascending keys are at least so large."""
+    """The first position from `low` to `high` at which ascending keys reach a value."""
     while low < high:
         middle = (low + high) >> 1
         if keys[middle] < least:
@@ -130,7 +130,7 @@ def weigh(start, column, place, shape, u, level, normal, exponents, weights, nea
 
 @inlined
 def solve(system, right, least):
-    """Solve a system of four positive definite equations for the columns of `right`, in place, by Cholesky's factor."""
+    """Solve a positive definite system of four equations for the columns of `right`, in place, by Cholesky."""
     for j in range(4):
         for k in range(j):
             system[j, j] -= system[j, k] * system[j, k]
@@ -187,13 +187,14 @@ def estimate(
         w = hat(dx) hat(dy) hat(dz) exp(-(δ/LEVEL)²/2) / |∇h'| exp(-(1 - n·n')/TURN),   δ = |c' - c| / |∇h'|,
 
     the value is that of the linear function of position which fits best (moving least squares, a ridge on its slope),
-    held within the range of the samples. A steep sample is near to more levels: divided by its slope, the weight is the
-    same in sum over all levels, or steep places, which are brighter on rough fields, would be preferred. Fills found
-    (C,); returns variance and number of samples, 0 if none is near. Where channels are mixed later, `each` (m, C) is
-    the variance of every channel of the samples, and bars[0] becomes that of the answer; else both have no columns.
+    clamped to the range of the samples. A steep sample is close to more levels; its weight is divided by its slope, so
+    that its sum over all levels is the same. Otherwise steep places, which are brighter on rough fields, would
+    dominate. Fills found (C,); returns variance and number of samples, 0 if none is near. If channels are mixed later,
+    `each` (m, C) is the variance of every channel of the samples, and bars[0] becomes that of the result; else both
+    have no columns.
 
-    The variance is Σ a² σ² of the samples' noise, a their weights in the fit, and (1 + Σ a²) s², s² being by how much
-    more than noise the samples around scatter about the fit: the light at the point does so too.
+    The variance is Σ a² σ² from the samples' noise, with their weights a in the fit, plus (1 + Σ a²) s², where s² is
+    the scatter of the samples about the fit beyond noise; the light at the point is assumed to scatter as much.
     """
     count, channels = weigh(start, column, place, shape, u, level, normal, exponents, weights, near), light.shape[1]
     if count == 0:
@@ -257,8 +258,8 @@ def fill(
 ):
     """Fill light (n, C), error and support (n,) at nodes in voxel coordinates x (n, 3), and `errors` of each channel.
 
-    A node whose value lies beyond the `ends` of the range reads at the nearest end, where the gradient leads to it. u
-    is x times `ratio`; `dark` are the flat numbers, in order, of the nodes of the lit lattice that are holes.
+    A node whose value lies beyond the `ends` of the range is moved along the gradient to the nearest end first. u is x
+    times `ratio`; `dark` are the flat numbers, in order, of the nodes of the lit lattice that are holes.
     """
     exponents, weights, near = np.empty(MOST), np.empty(MOST), np.empty(MOST, np.int64)
     system, right = np.empty((4, 4)), np.empty((4, light.shape[1] + 1))

@@ -8,27 +8,27 @@ import numpy as np
 
 from illumgrid.compiled import njit
 
-FAR = 1e300  # as far as a coordinate can be, for one that is infinite
+FAR = 1e300  # the largest coordinate, in place of an infinite one
 inlined = njit(_nrt=False, forceinline=True)
 
 
 @njit(_nrt=False)
 def finite(x):
-    """A coordinate that arithmetic keeps finite; 0 for NaN."""
+    """A coordinate that keeps arithmetic finite; 0 for NaN."""
     return min(max(x, -FAR), FAR) if x == x else 0.0
 
 
 @inlined
 def snapped(u, snap):
-    """A share of a cell; one that is as good as at its end is there."""
+    """A fraction of a cell, moved to the end of the cell if it is within rounding of it."""
     return 0.0 if u < snap else 1.0 if u > 1.0 - snap else u
 
 
 @inlined
 def locate(shape, side, corner, step, slot, snap, x, y, z):
-    """The block that is read, its cell, the shares of that, and whether the block holds the place.
+    """The block that is read, its cell, the fractions within it, and whether the block contains the place.
 
-    Beyond the border the border is read; where no block lies, the nearest one's.
+    Beyond the border, the border is read; outside all blocks, the border of the nearest one.
     """
     x = min(max(x, 0.0), shape[0] - 1.0)
     y = min(max(y, 0.0), shape[1] - 1.0)
@@ -78,8 +78,8 @@ def read(values, shape, side, corner, step, slot, origin, direction, spacing, sn
 def answer(light, error, support, shape, side, corner, step, slot, snap, index, out, bars, counts):
     """Fill light (n, m), error (n,) and support (n,) at fractional indices (n, 3).
 
-    The error is the weighted mean of the nodes', infinite where one has none, the support the smallest; a place in no
-    block has neither.
+    The error is the weighted mean of the nodes' errors, infinite if one is unknown; the support is the smallest.
+    Outside all blocks the error is infinite and the support 0.
     """
     for i in range(index.shape[0]):
         x, y, z = finite(index[i, 0]), finite(index[i, 1]), finite(index[i, 2])

@@ -46,14 +46,14 @@ class WallTexture:
         return np.ascontiguousarray(self.channels.rgb(result))
 
 
-_NEAR = 2, 1, 1  # rows of the sweep and texels on either side that are averaged
+_NEAR = 2, 1, 1  # rows of the sweep, and texels on either side, that are averaged
 _ALIKE = 1.0  # excess over the noise of a squared difference, in units of that noise, at which a weight falls to 1/e
 
 
 def calmed(
     light: NDArray[np.float32], seen: NDArray[np.float32], error: NDArray[np.float32], support: NDArray[np.float32]
 ) -> NDArray[np.float32]:
-    """Light whose noise is averaged away, and whose shadows stay sharp.
+    """Light of a wall with its noise averaged out; shadows stay sharp.
 
     Each texel becomes the mean of those near it, on the wall and in the sweep, that differ from it by no more than
     their noise; the edge of a shadow differs by more. Means over 3 x 3 texels are compared (A. Buades, B. Coll and
@@ -66,7 +66,7 @@ def calmed(
     seen : (K, nv, nu, 3) float32
         The same as it was baked, in RGB, which is compared.
     error : (K, nv, nu) float32
-        Standard error of `seen`; where one is not finite, light stays as it is.
+        Standard error of `seen`; where it is not finite, light stays as it is.
     support : (K, nv, nu) float32
         0 for a texel without light, which neither gives nor takes.
     """

@@ -1,4 +1,4 @@
-"""Each node reads the samples around it by place, level and normal: a joint bilateral filter, linear in space."""
+"""Each node is a fit to the samples around it by position, level and normal: a joint bilateral filter."""
 
 import os
 from collections.abc import Callable
@@ -17,13 +17,13 @@ from illumgrid.grid.nodes import reached
 from illumgrid.stages import Interpolator, hookimpl
 from illumgrid.transport.samples import Samples
 
-_BLOCK = 1 << 14  # samples of which queries are held
-_SLAB, _CHUNK = 1 << 18, 1 << 12  # samples that are held in order, about, and nodes that one thread reads at a time
-_ON_A_NODE = 1e-6  # of a spacing
+_BLOCK = 1 << 14  # samples whose queries are held
+_SLAB, _CHUNK = 1 << 18, 1 << 12  # approximate number of sorted samples held, and nodes that one thread fills at a time
+_ON_A_NODE = 1e-6  # of a node spacing
 
 
 class Sorted(NamedTuple):
-    """Samples of some planes of the lit lattice, in the order of the nodes that they are next to."""
+    """Samples of some planes of the lit lattice, in the order of their nearest nodes."""
 
     near: NDArray[np.integer]  # (m,) flat numbers of those nodes
     place: NDArray[np.float32]  # (m, 8): see `illumgrid.grid.reading.estimate`
@@ -40,7 +40,7 @@ def _next_to(spec: GridSpec, points: Floats) -> tuple[Floats, NDArray[np.int64]]
 
 
 def _planes(samples: Samples, spec: GridSpec) -> NDArray[np.integer]:
-    """The plane (n,), along the first axis, of the node that each sample is next to."""
+    """The plane (n,) along the first axis of the node nearest to each sample."""
     plane = np.empty(len(samples), np.min_scalar_type(spec.shape[0]))  # one byte each, usually
     for first in range(0, len(samples), _BLOCK):
         some = slice(first, first + _BLOCK)
@@ -49,7 +49,7 @@ def _planes(samples: Samples, spec: GridSpec) -> NDArray[np.integer]:
 
 
 def _in_order(samples: Samples, rows: NDArray[np.integer], nodes: Nodes) -> Sorted:
-    """Sort some of the samples into the nodes' lattice; holes are left out, and marked."""
+    """Sort some of the samples into the nodes' lattice; holes are left out and recorded."""
     from illumgrid.grid.reading import slopes
 
     spec, volume = nodes.spec, nodes.field.volume
@@ -66,7 +66,7 @@ def _in_order(samples: Samples, rows: NDArray[np.integer], nodes: Nodes) -> Sort
     each = np.empty((len(rows), channels), np.float32)
     for first in range(0, len(rows), _BLOCK):
         here = slice(first, first + _BLOCK)
-        part = samples[rows[here]]  # its queries are computed here, where only numbers of nodes are kept
+        part = samples[rows[here]]  # queries are computed here if only numbers of nodes are kept
         queries, (index, closest) = part.queries, _next_to(spec, part.queries.point)
         near[here], ids[here] = np.ravel_multi_index(tuple(closest.T), spec.shape), queries.id
         slope = np.zeros(len(part))
@@ -86,7 +86,7 @@ def _in_order(samples: Samples, rows: NDArray[np.integer], nodes: Nodes) -> Sort
 
 
 def _level_units(nodes: Nodes) -> tuple[float, float]:
-    """What turns stored values into shares of the range, in which single precision is enough."""
+    """Scale and origin that map stored values to shares of the range, for which single precision is enough."""
     low, high = nodes.field.stored_range
     return 1.0 / float(high - low), float(low)
 
@@ -138,7 +138,7 @@ Found = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32], NDA
 
 
 def _empty(count: int, samples: Samples) -> Found:
-    """Nodes that nothing is known of."""
+    """Nodes without light."""
     channels = samples.light.shape[1]
     each = np.full((count, channels if samples.channels.mixable else 0), np.inf, np.float32)
     light, support = np.zeros((count, channels), np.float32), np.zeros(count, np.float32)

@@ -44,7 +44,9 @@ class Nearest:
                     errors[some] = own.errors
 
         def points() -> Iterator[tuple[NDArray[np.int64], Floats]]:
-            for first in range(0, len(samples), _SLAB):  # numbers of all at once would take a fifth of what they hold
+            for first in range(
+                0, len(samples), _SLAB
+            ):  # in parts: the numbers of all samples would take a fifth of their memory
                 good = first + np.flatnonzero(samples.paths[first : first + _SLAB] > 0)
                 yield good, samples.queries[good].point
 

@@ -1,4 +1,4 @@
-"""The samples behind a node: the nearest ones on both level sets that it lies between."""
+"""The samples around a node: the nearest ones on both level sets between which it lies."""
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ def diagonal(spec: GridSpec) -> float:
 
 
 def near_samples(spec: GridSpec, parts: Iterable[Floats], reach: float) -> NDArray[np.bool_]:
-    """Nodes (nx, ny, nz) that may have a world point of some arrays (n, 3) in their box of half-width `reach`."""
+    """Nodes (nx, ny, nz) that may have a world point of some arrays (n, 3) within `reach` along each axis."""
     from scipy.ndimage import maximum_filter
 
     taken = np.zeros(spec.shape, bool)

@@ -1,4 +1,4 @@
-"""Nodes that were lit in a lattice of which not all were, and light between the others."""
+"""A lattice of which only some nodes were lit: filtered light at these, interpolated light at the others."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -26,8 +26,8 @@ BLOCKS = 256
 class Nested:
     """Light at some nodes of a lattice: every 2**levels-th along each axis, and finer ones where light is rough.
 
-    A lit node reads the lit nodes of its level around it by place, level and normal: see `Bilateral`. Other nodes take
-    the light between those of the next coarser level, linearly.
+    A lit node averages the lit nodes of its lattice around it by position, level and normal: see `Bilateral`. Other
+    nodes are interpolated linearly from the next coarser lattice.
 
     Parameters
     ----------
@@ -58,7 +58,7 @@ class Nested:
 def _level(
     samples: Samples, place: NDArray[np.int64], nodes: Nodes, level: int, below: IlluminationGrid | None
 ) -> IlluminationGrid:
-    """Grid of the blocks down to one level, from the samples at its nodes (n, 3) and from the levels below."""
+    """Grid of the blocks down to one level, from the samples at its nodes (n, 3) and from `below`, the coarser grid."""
     own, step = Nodes(coarser(nodes.spec, level), nodes.field, nodes.number), 2**level
     if below is None:
         return _coarsest(samples, place, nodes, own, step)
@@ -71,7 +71,7 @@ def _level(
     )  # fmt: skip
     mine = np.flatnonzero(_around(fresh, place, nodes, step))
     mine = mine[~beside_coarser(layout, place[mine], step)]
-    # Other nodes have the light between those below. There a lookup was as far off as `bar` says; so are they.
+    # Other nodes are interpolated from the coarser grid, and have the error `bar` of a lookup there.
     old = held.light, held.error, held.support
     light, error, support = (np.empty((len(layout), *array.shape[1:]), np.float32) for array in old)
     for array, below_here in zip((light, error, support), old):
@@ -85,20 +85,20 @@ def _level(
     found = read(samples, own, own, np.ravel_multi_index(tuple((place[mine] // step).T), own.spec.shape))[:3]
     lit, low, high = found[2] > 0, *nodes.field.range
     isovalue = samples.queries[mine].level[:, nodes.number]
-    hole = mine[~lit & (isovalue > low) & (isovalue < high)]  # shows what is between its neighbours
+    hole = mine[~lit & (isovalue > low) & (isovalue < high)]  # has light interpolated from its neighbours
     put(layout, place[mine[lit]], step, (light, error, support), [part[lit] for part in found])
     put(layout, place[hole], step, (error, support), (np.inf, 0.0))
     return IlluminationGrid(nodes.spec, channels=samples.channels, held=Held(layout, light, error, support))
 
 
 def _coarsest(samples: Samples, place: NDArray[np.int64], nodes: Nodes, own: Nodes, step: int) -> IlluminationGrid:
-    """Grid of blocks of the coarsest level, where all corners of a cell were asked."""
+    """Grid of blocks of the coarsest level, where all corners of a cell were lit."""
     from scipy.spatial import KDTree
 
     flat = np.ravel_multi_index(tuple((place // step).T), own.spec.shape)
     light, error, support, _ = read(samples, own, own, flat)
     dark, lit = np.flatnonzero(support == 0), np.flatnonzero(samples.paths > 0)
-    if len(dark) and len(lit):  # at the rim, without a point of their own: the light of the nearest sample
+    if len(dark) and len(lit):  # rim nodes without a point of their own have the light of the nearest sample
         tree = KDTree(samples.queries.point[lit] - own.spec.origin)
         far, sample = tree.query(own.spec.nodes(flat[dark]) - own.spec.origin, distance_upper_bound=diagonal(own.spec))
         dark, sample = dark[np.isfinite(far)], lit[sample[np.isfinite(far)]]
@@ -116,7 +116,7 @@ def _coarsest(samples: Samples, place: NDArray[np.int64], nodes: Nodes, own: Nod
 
 
 def _around(fresh: NDArray[np.bool_], place: NDArray[np.int64], nodes: Nodes, step: int) -> NDArray[np.bool_]:
-    """Which nodes (n, 3) are `fresh`, of this level alone, or beside one: those of cells that are halved here."""
+    """Which nodes (n, 3) are `fresh`, new at this level, or next to one: those of the cells that are refined here."""
     near = np.zeros(np.array(nodes.spec.shape) // step + 1, bool)
     near[tuple((place[fresh] // step).T)] = True
     for axis in range(3):

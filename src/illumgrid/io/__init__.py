@@ -1,1 +1,1 @@
-"""What is on disk: volumes and scenes, finished runs, exports."""
+"""Access to the disk: volumes and scenes, finished runs, exports."""

@@ -1,4 +1,4 @@
-"""Whole files and folders or none: written in a hidden folder beside their place, brought to the disk, then renamed.
+"""Complete files and folders or none: written in a hidden folder beside their place, synced to the disk, then renamed.
 
 The order is that of a database's commit: the bytes of each file, the names in its folder, the rename, the names in the
 folder above. A power cut at any moment leaves what was there before or what came new, both whole. The hidden folder is
@@ -23,16 +23,16 @@ ELSEWHERE = "choose another folder"
 STOPS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
 
 written: list[Path] = []
-"""What this process has put in place, in order: the truth to tell when it is stopped."""
+"""What this process has put in place, in order, for the message when it is stopped."""
 begun: list[Path] = []
-"""Hidden folders that are being written; a process that is ended from outside its work removes them."""
+"""Hidden folders that are being written; a process that is ended by a thread removes them."""
 kept: list[str] = []
 """What a stopped process has kept of its work, as a sentence; empty where there is nothing."""
 
 
 @contextmanager
 def sentences(trouble: str, remedy: str) -> Iterator[None]:
-    """Turn whatever goes wrong into one sentence of what came and what to do."""
+    """Turn any exception into one sentence: what happened and what to do."""
     try:
         yield
     except BadInput as reason:
@@ -45,12 +45,12 @@ def sentences(trouble: str, remedy: str) -> Iterator[None]:
 
 
 def sync(place: Path) -> None:
-    """Bring a file, or a folder with the files in it, to the disk; raises OSError if the disk cannot take it."""
+    """Sync a file, or a folder with the files in it, to the disk; raises OSError if that fails."""
     folder = place.is_dir()
     if folder:
         for file in sorted(place.iterdir()):
             _fsync(file, os.O_RDWR if os.name == "nt" else os.O_RDONLY)
-    if not folder or os.name != "nt":  # Windows opens no folders
+    if not folder or os.name != "nt":  # Windows cannot open folders
         _fsync(place, os.O_RDWR if os.name == "nt" else os.O_RDONLY)
 
 
@@ -67,8 +67,8 @@ def _fsync(path: Path, flags: int) -> None:
 
 @contextmanager
 def held() -> Iterator[None]:
-    """Let Ctrl-C, SIGTERM and SIGHUP wait until the block is through: between two renames nobody may stop."""
-    if threading.current_thread() is not threading.main_thread():  # Python stops the main thread only
+    """Delay Ctrl-C, SIGTERM and SIGHUP to the end of the block: two renames must not be separated."""
+    if threading.current_thread() is not threading.main_thread():  # Python interrupts only the main thread
         yield
         return
     came: list[int] = []
@@ -86,7 +86,7 @@ def held() -> Iterator[None]:
 
 
 def put(fresh: Path, place: Path, move: Callable[[Path, Path], Any] | None = None) -> None:
-    """Bring `fresh` to the disk and rename it to `place`, by `move`; when this returns, a power cut changes nothing."""
+    """Sync `fresh` to the disk and rename it to `place`, by `move`; afterwards a power cut changes nothing."""
     sync(fresh)
     with held():
         (move or os.replace)(fresh, place)
@@ -107,7 +107,7 @@ def make_parents(place: Path) -> None:
 def beside(place: Path) -> Iterator[Path]:
     """Give an empty hidden folder beside `place`, which is gone afterwards; those of dead processes go first."""
     sweep(place)
-    with temporary(f".{place.name[:50]}-", place.parent) as work:  # cut, or the name would get too long
+    with temporary(f".{place.name[:50]}-", place.parent) as work:  # shortened, or the name would be too long
         yield work
 
 
@@ -135,7 +135,7 @@ def temporary(prefix: str, above: Path) -> Iterator[Path]:
 
 
 def lock(folder: Path) -> int | None:
-    """Lock a folder until the process ends; None where that is not known. BlockingIOError if another holds it."""
+    """Lock a folder until the process ends; None if locks are not supported. BlockingIOError if another holds it."""
     try:
         import fcntl
     except ImportError:  # Windows
@@ -154,13 +154,13 @@ def lock(folder: Path) -> int | None:
 
 
 def sweep(place: Path) -> None:
-    """Remove the hidden folders that killed writers of `place` left; a run that one had moved aside goes back."""
+    """Remove the hidden folders that killed writers of `place` left, and restore a run that one had moved aside."""
     if len(place.name) > 50:  # the names of several places begin like this
         return
     pattern = re.compile(re.escape(f".{place.name}-") + "[a-z0-9_]{8}")
     with suppress(OSError):
         for found in [p for p in place.parent.iterdir() if pattern.fullmatch(p.name)]:
-            with suppress(OSError):  # another process is at work in it, or it is not ours
+            with suppress(OSError):  # another process works in it, or it is not ours
                 if found.is_symlink() or not all(p.stem in ("new", "old") for p in found.iterdir()):
                     continue
                 handle = lock(found)
@@ -177,7 +177,7 @@ def sweep(place: Path) -> None:
 
 @contextmanager
 def fresh_file(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Give a place beside `path` to write a file to, and rename it in the end: whole, or not there.
+    """Yield a path beside `path` for a file, and rename it at the end: complete, or absent.
 
     Raises
     ------
@@ -202,7 +202,7 @@ def write_file(path: str | os.PathLike[str], content: bytes) -> None:
 
 
 def claim_new(path: str | os.PathLike[str]) -> None:
-    """Raise BadInput if something is at `path` already, but for an empty folder, or if nothing can be written there."""
+    """Raise BadInput if something other than an empty folder is at `path`, or if nothing can be written there."""
     place = Path(os.path.abspath(path))
     if place.exists() and not (place.is_dir() and not any(place.iterdir())):
         raise BadInput(f"{path} is there already; expected the name of a new folder: choose another")
@@ -211,7 +211,7 @@ def claim_new(path: str | os.PathLike[str]) -> None:
 
 
 def try_to_write(path: str | os.PathLike[str]) -> None:
-    """Find out about permissions, quota, read-only disks: make a hidden folder where `path` will be, with a byte."""
+    """Check permissions, quota and read-only disks by writing a byte to a hidden folder where `path` will be."""
     place = Path(os.path.abspath(path))
     above = next(p for p in place.parents if os.path.lexists(p))
     full = sentences(f"{path} could not be written; the disk may be full", ELSEWHERE)
@@ -220,7 +220,7 @@ def try_to_write(path: str | os.PathLike[str]) -> None:
 
 
 def write_folder(path: str | os.PathLike[str], files: Iterator[tuple[str, bytes]]) -> None:
-    """Write named files into a new folder beside its place and rename it: whole, or not there.
+    """Write named files into a new folder beside its place and rename it: complete, or absent.
 
     Raises
     ------
@@ -236,6 +236,6 @@ def write_folder(path: str | os.PathLike[str], files: Iterator[tuple[str, bytes]
             fresh.mkdir()  # with the umask's mode; `work` is closed to others
             for name, content in files:
                 (fresh / name).write_bytes(content)
-            with suppress(OSError):  # only an empty folder goes
+            with suppress(OSError):  # removes only an empty folder
                 place.rmdir()
             put(fresh, place, os.rename)

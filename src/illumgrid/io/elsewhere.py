@@ -1,4 +1,4 @@
-"""Fields of a volume file, as a run uses them; and a run that refers to that file in place of holding them."""
+"""Fields of a volume file, as a run uses them; and runs that refer to that file instead of storing them."""
 
 import hashlib
 import os
@@ -17,7 +17,7 @@ from illumgrid.io.readers import read_volume
 
 @dataclass(frozen=True)
 class Source:
-    """Where the fields of a run come from.
+    """The source of the fields of a run.
 
     Parameters
     ----------
@@ -28,7 +28,7 @@ class Source:
     labels : sequence of int
         One field for each; none: the values of the file.
     side : {"above", "below"} or None
-        What is solid, which decides what becomes of gaps; None for a field of both signs.
+        Which side is solid, which determines how gaps are filled; None for a field of both signs.
     blur : float
         Voxels by which the field was smoothed.
     """
@@ -65,14 +65,14 @@ def digest(volume: Volume) -> str:
 
 
 def referred(source: Source, folder: Path) -> dict[str, Any]:
-    """What the record of a run at `folder` says of its source: where it is, also from there, and how it was read."""
+    """The entry for the source of the run at `folder`: its path, also relative to the folder, and how it was read."""
     path = os.path.abspath(source.path)
     near = os.path.relpath(path, folder) if Path(path).anchor == folder.anchor else path
     return asdict(source) | {"path": path, "near": near}
 
 
 def fields_again(about: Mapping[str, Any], folder: Path, digests: Sequence[str]) -> list[Volume]:
-    """The volumes that a record refers to, one for each digest.
+    """The volumes to which a record refers, one for each digest.
 
     Raises
     ------
@@ -87,7 +87,7 @@ def fields_again(about: Mapping[str, Any], folder: Path, digests: Sequence[str])
     reading = {name: about["reading"][name] for name in names if name in about["reading"]}
     source = Source(path, reading, about["labels"], about["side"], float(about["blur"]))
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # they were said when the run was made, and are in its record
+        warnings.simplefilter("ignore")  # the notes were issued when the run was made, and are in its record
         for folded in (False, True):
             found = list(source.volumes(folded).values())
             found = found if len(found) == len(digests) else found * len(digests)  # both signs of one volume

@@ -23,7 +23,7 @@ from illumgrid.io import scanlines
 LAYOUT = "array (nx, ny, nz) = ({}, {}, {}); row = z*ny + y, column = x"
 FIELD = "array (nx, ny, nz) = ({}, {}, {}) of {}; row = x*ny + y, column = z"
 BYTES = "bytes"
-DEFLATE_AT_MOST = 1032  # bytes out for one byte in: a file that claims more is refused before memory is asked for
+DEFLATE_AT_MOST = 1032  # bytes out for one byte in: a file that claims more is refused before memory is allocated
 _WORD = 4  # bytes of a pixel
 _MULTIPART = 1 << 12  # in the version of a file
 _LINES = scanlines.LINES
@@ -50,13 +50,13 @@ class Planned:
 
     @property
     def layout(self) -> str:
-        """In words."""
+        """The layout in words."""
         return FIELD.format(*self.shape, self.kind) if self.field else LAYOUT.format(*self.shape)
 
 
 @dataclass(frozen=True, eq=False)
 class Words:
-    """The rows of a field as whole words; slices of it are images, made when they are asked for."""
+    """The rows of a field as whole words; slices of it are images, made on access."""
 
     values: NDArray[Any]
     dtype = np.dtype(np.uint32)
@@ -69,7 +69,7 @@ class Words:
 
 @dataclass(frozen=True, eq=False)
 class Turned:
-    """An array (nx, ny, nz) as an image nx wide; slices of it are images, made when they are asked for."""
+    """An array (nx, ny, nz) as an image nx wide; slices of it are images, made on access."""
 
     array: NDArray[np.float32]
     dtype = np.dtype(np.float32)

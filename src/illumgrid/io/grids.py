@@ -14,7 +14,7 @@ from illumgrid.io import exr
 
 Images = dict[str, tuple[exr.Planned, dict[str, exr.Rows]]]
 PLACES = ("x", "y", "z", "step")
-"""Of a block: its first node in the finest lattice, and how many of that lattice's spacings lie between its nodes."""
+"""Of a block: its first node in the finest lattice, and the distance of its nodes in spacings of that lattice."""
 MOST_BLOCKS = 2**24  # whose numbers single precision still counts
 _NODES = (SIDE + 1) ** 3
 
@@ -29,7 +29,7 @@ def _names(channels: Channels) -> tuple[str, ...]:
 
 
 def blocks_of(grid: IlluminationGrid) -> int:
-    """How many blocks are written; 0 for all nodes of the lattice."""
+    """Number of blocks that are written; 0 for all nodes of the lattice."""
     layout = grid.held.layout
     return 0 if layout.dense or (layout.side != SIDE).any() else len(layout)
 
@@ -45,7 +45,7 @@ def planned(name: str, shape: tuple[int, int, int], channels: Channels, blocks: 
 
 
 def count_of(about: Mapping[str, Any]) -> int:
-    """How many blocks a record says that a grid has, 0 for none.
+    """The number of blocks of a grid in a record, 0 for none.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Which run a folder is of: what decides its light, with a digest for whatever is large, and how two runs differ."""
+"""The identity of a run, everything that determines its light, with digests of large data; differences of runs."""
 
 import hashlib
 import json
@@ -15,11 +15,11 @@ from illumgrid.field.scene import Scene
 Record = dict[str, Any]
 
 MACHINE = ("versions", "processor")
-"""What may differ where --any-machine is given: then light may differ in its last digits."""
+"""Entries that may differ with --any-machine: the light may then differ in its last digits."""
 
 
 def digest(thing: Any) -> str:
-    """Digest of dataclasses, arrays, and what JSON has, by content."""
+    """Digest of dataclasses, arrays, and types of JSON, by content."""
     found = hashlib.sha256()
     take_in(thing, found.update)
     return found.hexdigest()
@@ -48,7 +48,7 @@ def take_in(thing: Any, update: Callable[[Any], None]) -> None:
 
 
 def identity(scene: Scene, stages: Mapping[str, Any], **asked: float | None) -> Record:
-    """What decides a run's light, with a digest for whatever is large.
+    """Everything that determines a run's light, with digests of large data.
 
     Parameters
     ----------
@@ -60,7 +60,7 @@ def identity(scene: Scene, stages: Mapping[str, Any], **asked: float | None) -> 
     """
     given: Record = dict(asked)
     for kind, stage in stages.items():
-        options = {name: value for name, value in asdict(stage).items() if name != "threads"}  # which decide no light
+        options = {name: value for name, value in asdict(stage).items() if name != "threads"}  # no effect on the light
         given |= {kind: {"name": stage.name, **options}}
     given |= machine()
     about = {f"field {field.name!r}": digest(field) for field in scene.fields}
@@ -69,7 +69,7 @@ def identity(scene: Scene, stages: Mapping[str, Any], **asked: float | None) -> 
 
 
 def machine() -> Record:
-    """What of an identity is of this machine: `MACHINE`."""
+    """The part of an identity that describes this machine: `MACHINE`."""
     from llvmlite.binding import get_host_cpu_name
 
     versions = {name: version(name) for name in ("illumgrid", "numba", "numpy", "scipy")}
@@ -77,7 +77,7 @@ def machine() -> Record:
 
 
 def differences(one: Record, other: Record) -> list[str]:
-    """What two runs do not have in common, in words."""
+    """The differences between two runs, in words."""
     found = []
     for key in sorted(one.keys() | other.keys()):
         a, b = one.get(key), other.get(key)

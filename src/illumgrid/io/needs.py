@@ -1,6 +1,6 @@
-"""The memory that a command is going to take, refused before any of it is taken.
+"""Estimates of a command's memory, by which it is refused before it takes any.
 
-Bytes are peaks measured by `benchmarks/memory.py`, above what is held when the question is asked.
+Bytes are peaks measured by `benchmarks/memory.py`, in addition to what is held at the time of the check.
 """
 
 from collections.abc import Sequence
@@ -19,18 +19,18 @@ if TYPE_CHECKING:
     from illumgrid.field.scene import Field, Levels, Scene
 
 TO_DESCRIBE = 21
-"""Bytes a voxel for the histogram, plateaus and warnings of a volume that is read; of a large one, see `of_field`."""
+"""Bytes per voxel for the histogram, plateaus and warnings of a volume; for a large one, see `of_field`."""
 TO_LIGHT = 44
-"""Bytes a voxel for diagnosis, preparation and writing of a field; of a large one, see `of_field`."""
+"""Bytes per voxel for diagnosis, preparation and writing of a field; for a large one, see `of_field`."""
 _WHOLE, _IN_PARTS = 1 << 24, 3e8
 """Voxels of a field of which all are looked at together; bytes for the parts of a larger one (0.25 GB of 512³ and of
 1024³). The field itself is there, or paged, and so are its bricks when a run asks."""
 TO_DEPOSIT = 18
-"""Bytes a voxel for the density of points."""
+"""Bytes per voxel for the density of points."""
 TO_EXTRACT = 16
-"""Bytes a voxel for the extraction of an isosurface."""
+"""Bytes per voxel for the extraction of an isosurface."""
 _CROSSING = 270
-"""Bytes, in a file of an isosurface, for each edge between voxels that it crosses."""
+"""Bytes in a file of an isosurface per edge between voxels that it crosses."""
 _QUERY, _CHANNEL, _PIECE = 300, 20, 1 << 16
 """Bytes a query, and for each channel of its answer; queries held at a time where they are those of nodes."""
 _IN_BLOCKS, _SPARE = 25.0, 1.63
@@ -45,13 +45,13 @@ together."""
 
 
 def check(what: str, need: float, todo: str) -> None:
-    """Refuse what needs more bytes of memory than are free."""
+    """Refuse a command that needs more bytes of memory than are free."""
     if need > (free := free_memory()):
         raise BadInput(f"{what} needs {gigabytes(int(need))} of memory, {gigabytes(free)} are free; {todo}")
 
 
 def of_field(voxels: int, each: int) -> float:
-    """Bytes for a field that takes `each` a voxel: a large one is looked at in parts."""
+    """Bytes for a field that takes `each` per voxel; a large one is examined in parts."""
     return each * voxels if voxels <= _WHOLE else _IN_PARTS
 
 
@@ -59,7 +59,7 @@ def check_run(
     scene: "Scene", specs: Sequence[GridSpec], levels: "Levels", density: float = 1.0, *, at_nodes: bool = False,
     refining: bool = False,
 ) -> None:  # fmt: skip
-    """Refuse a run whose nodes, walls and fields do not fit, and say which grid would.
+    """Refuse a run whose nodes, walls and fields do not fit into memory, and name a grid that would.
 
     Parameters
     ----------
@@ -93,10 +93,10 @@ def check_run(
 
 
 def check_surface(field: "Field", isovalue: float, todo: str) -> None:
-    """Refuse the extraction of an isosurface whose triangles do not fit; counts what it crosses."""
+    """Refuse the extraction of an isosurface whose triangles do not fit into memory; counts the edges it crosses."""
     values, level = field.volume.stored, float(field.volume.to_stored(isovalue))
     crossed = 0
-    for k in range(0, len(values), 16):  # some slices at a time: what is compared takes memory, too
+    for k in range(0, len(values), 16):  # some slices at a time: comparisons take memory, too
         above = values[k : k + 17] >= level
         for axis, part in enumerate((above, above[:16], above[:16])):
             crossed += int(np.count_nonzero(np.diff(part, axis=axis)))
@@ -104,13 +104,13 @@ def check_surface(field: "Field", isovalue: float, todo: str) -> None:
 
 
 def _share(field: "Field", spec: GridSpec) -> float:
-    """Share of the nodes that lie within a cell of isosurfaces of the range, about: they are asked about."""
+    """Approximate share of the nodes that lie within a cell of isosurfaces of the range, and are lit."""
     values = field.volume.stored
     last = np.array(values.shape) - 1
     cell = np.ceil(last / np.maximum(np.array(spec.shape) - 1, 1)).astype(np.int64)
     some = np.arange(0, values.size, max(1, values.size // _SOME))
     (low, high), met = sorted(field.stored_range), 0
-    for first in range(0, len(some), _NEAR):  # all ways at a time: a field that is paged is read once
+    for first in range(0, len(some), _NEAR):  # all directions at a time: a field that is paged is read once
         index = np.stack(np.unravel_index(some[first : first + _NEAR], values.shape), axis=1)
         least, most = (np.full(len(index), end, float) for end in (np.inf, -np.inf))
         for way in np.ndindex(3, 3, 3):

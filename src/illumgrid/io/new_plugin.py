@@ -1,4 +1,4 @@
-"""A package with one stage, to begin a plugin with: the examples of the documentation, under another name."""
+"""A package with one stage, to start a plugin with: the examples of the documentation under another name."""
 
 import os
 import re

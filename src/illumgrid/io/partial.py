@@ -1,12 +1,12 @@
-"""A run on its way: the light that it has finished, in ``DIR.partial`` beside its DIR.
+"""An unfinished run: the finished part of its light, in ``DIR.partial`` beside its DIR.
 
 ``light.zarr`` is a Zarr v3 group. For each range of paths it has a group ``0-32`` with the arrays ``light`` and
-``spread`` (n, C) and ``paths`` (n,): a row for each node or texel asked about, in the order in which they are walked
-from; paths is -1 where nothing is known. The library writes each chunk whole; ``paths`` is written last, so that a row
-counts when all of it is there. The attributes say of which run this is, and what that run had chosen. ``scene`` is a
-finished run's folder without light, so that a picture needs nothing else.
+``spread`` (n, C) and ``paths`` (n,): a row for each node or texel, in the order in which they are computed; paths is -1
+where nothing is known. The library writes each chunk as a whole; ``paths`` is written last, so that a row counts only
+when all of it is there. The attributes identify the run, and record what it had chosen. ``scene`` is a finished run's
+folder without light, so that a picture needs nothing else.
 
-A finished run keeps its moments in ``moments.npz``: more paths go on from there.
+A finished run keeps its moments in ``moments.npz``, to which more paths can be added.
 """
 
 import hashlib
@@ -32,11 +32,11 @@ from illumgrid.samplers.direct import NodeQueries
 from illumgrid.transport.samples import Queries, Samples
 from illumgrid.transport.walk import Answer
 
-FORMAT = 2  # 1 had nodes that the projection moves in another order
+FORMAT = 2  # format 1 had nodes that the projection moved in another order
 EVERY = 10.0
-"""Seconds from one writing to the next, and before the first: a shorter run leaves nothing."""
+"""Seconds from one write to the next, and before the first: a shorter run leaves nothing."""
 HELD = 1 << 20
-"""Rows that are held until then, at most."""
+"""Largest number of rows that are held until then."""
 CHUNK = 4096
 """Rows of a chunk."""
 MOMENT_ARRAYS = ("light", "spread", "paths")
@@ -44,7 +44,7 @@ SUFFIX, LIGHT, SCENE = ".partial", "light.zarr", "scene"
 
 
 class Partial:
-    """What a run has finished: keeps it, and gives it to a run that goes on; a `illumgrid.transport.walk.Keeper`.
+    """The finished light of a run: keeps it, and returns it to a resumed run; a `illumgrid.transport.walk.Keeper`.
 
     Parameters
     ----------
@@ -64,9 +64,9 @@ class Partial:
         self, folder: Path, about: Record, command: str, scene: Callable[[Path], None] = lambda folder: None
     ) -> None:
         self.place = beside(folder)
-        disk.sweep(self.place)  # a short run writes nothing, and would leave what killed ones left
+        disk.sweep(self.place)  # a short run writes nothing, and would not remove what killed ones left
         self.about, self.command, self.write_scene = about, command, scene
-        self.chosen: Record | None = None  # by the run that is resumed: grid, bounces, walked...
+        self.chosen: Record | None = None  # by the run that is resumed: grid, bounces, paths...
         self.moments: list[Answer] = []
         self._before: dict[str, NDArray[Any]] = {}
         self._group: Any = None
@@ -80,7 +80,7 @@ class Partial:
     # --- what is there -------------------------------------------------------------------------------------------
 
     def resume(self, finished: Path | None, overwrite: bool, any_machine: bool) -> bool:
-        """Take up what an earlier process left beside, or in the folder of a `finished` run; whether there is anything.
+        """Read the light of an earlier process, or of a `finished` run; returns whether there is any.
 
         Raises
         ------
@@ -109,7 +109,7 @@ class Partial:
     def _resume_finished(self, finished: Path, any_machine: bool) -> bool:
         if not (finished / MOMENTS).is_file():
             return False
-        with disk.sentences(f"{finished / MOMENTS} cannot be used", "remove it: all paths are then walked again"):
+        with disk.sentences(f"{finished / MOMENTS} cannot be used", "remove it: all paths are then traced again"):
             with np.load(finished / MOMENTS, allow_pickle=False) as arrays:
                 self._before = {name: arrays[name] for name in arrays.files}
             kept = json.loads(str(self._before["about"]))
@@ -124,7 +124,7 @@ class Partial:
         return True
 
     def _differences(self, kept: Record, any_machine: bool) -> list[str]:
-        """Fewer paths are another run; more go on."""
+        """The differences between two runs, except for additional paths; fewer paths are another run."""
         free = set(MACHINE) if any_machine else set()
         if None not in (self.about.get("paths"), kept.get("paths")) and self.about["paths"] >= kept["paths"]:
             free.add("paths")
@@ -133,7 +133,7 @@ class Partial:
     # --- what comes in -------------------------------------------------------------------------------------------
 
     def choose(self, chosen: Record) -> None:
-        """Take down what was chosen, which a run that goes on takes over."""
+        """Record the choices of the run, for a run that resumes it."""
         self.chosen = dict(json.loads(json.dumps(chosen)))
 
     def begin(self, targets: Sequence[Queries], order: NDArray[np.int64]) -> None:
@@ -142,10 +142,10 @@ class Partial:
         self._place = np.empty(len(order), np.int32 if len(order) < 1 << 31 else np.int64)
         self._place[order] = np.arange(len(order), dtype=self._place.dtype)
         found = hashlib.sha256()
-        for queries in targets:  # the scene, whose digest is kept as well, decides where nodes are
+        for queries in targets:  # the scene, whose digest is stored as well, determines the nodes
             take_in(queries.node if isinstance(queries, NodeQueries) else queries, found.update)
         if self._asked not in ("", found.hexdigest()):
-            raise BadInput(f"{self.place} is of other points than the sampler asks about now; remove it to start over")
+            raise BadInput(f"{self.place} has other points than the sampler chooses now; remove it to start over")
         self._asked, self._last = found.hexdigest(), time.monotonic()
 
     def known(self, paths: range) -> Answer | None:
@@ -174,7 +174,7 @@ class Partial:
             self._write()
 
     def settle(self) -> None:
-        """Write now that the run is on its way, however short it may be."""
+        """Write now that the run has started, however short it may be."""
         if self._group is None:
             with disk.sentences(f"{self.place} could not be written", "choose another folder"), disk.held():
                 self._create()
@@ -191,7 +191,7 @@ class Partial:
         self._new.clear()
 
     def standing(self) -> str:
-        """What is kept where, for a line of progress; empty before anything is."""
+        """What is kept and where, for a line of progress; empty if nothing is."""
         blocks, of = self._stored // CHUNK, -(-self._count // CHUNK)
         return "" if self._group is None else f"{blocks} of {of} blocks of light are kept in {self.place.name}"
 
@@ -206,7 +206,7 @@ class Partial:
         with disk.sentences(f"{self.place} could not be written; the disk may be full", remedy):
             if self._group is None:
                 self._create()
-            # A chunk of zeros is a file too: it is brought to the disk like the others.
+            # A chunk of zeros is a file, too: it is brought to the disk like the others.
             with disk.held(), zarr.config.set({"array.write_empty_chunks": True}):
                 for paths in dict.fromkeys(p for p, _, _ in self._new):
                     some = [(rows, answer) for p, rows, answer in self._new if p == paths]
@@ -220,12 +220,12 @@ class Partial:
         disk.kept[:] = [f"{share}; the same command goes on from there"]
 
     def _add(self, paths: range, some: list[tuple[NDArray[np.int64], Answer]]) -> int:
-        """Write answers to some rows of a range of paths; returns how many."""
+        """Add answers to some rows of a range of paths; returns their number."""
         part, rows = self._part(paths, some[0][1].channels), np.concatenate([r for r, _ in some])
         order = np.argsort(rows, kind="stable")
         rows = rows[order]
         cuts = [0, *(np.flatnonzero(np.diff(rows // CHUNK)) + 1).tolist(), len(rows)]
-        for key, column in (("light", 0), ("spread", 1), ("paths", 2)):  # paths last: they make the others count
+        for key, column in (("light", 0), ("spread", 1), ("paths", 2)):  # paths last: they make the other arrays valid
             values = np.concatenate([answer[column] for _, answer in some])[order]
             for a, b in pairwise(cuts):  # each chunk once: its rows may come in any order
                 first = int(rows[a]) // CHUNK * CHUNK
@@ -249,7 +249,7 @@ class Partial:
                     "queries": self._asked, "rows": self._count,
                 }
             )  # fmt: skip
-            if place.is_dir():  # of another run, which was to be overwritten
+            if place.is_dir():  # of another run that was to be overwritten
                 place.rename(work / "old.part")
             disk.put(work / "new", place, os.rename)
         self._lock = _locked(place)
@@ -278,14 +278,14 @@ class Partial:
             disk.sync(file)
 
     def leave(self, finished: Path) -> None:
-        """Give the finished run its moments, and remove the partial one."""
+        """Give the finished run its moments, and remove the partial run."""
         if self.moments:
             walked, channels = self._walked[-1].stop, self.moments[0].channels
             named = {"names": channels.names, "mix": channels.mix}
             about = {"identity": self.about, "chosen": self.chosen, "queries": self._asked, "channels": named}
             texts = {"about": np.array(json.dumps(about)), "walked": np.array(walked)}
             with disk.fresh_file(finished / MOMENTS) as file, ZipFile(file, "w", ZIP_DEFLATED) as packed:
-                for key in (*texts, *MOMENT_ARRAYS):  # as `numpy.savez_compressed`, which wants all of them at once
+                for key in (*texts, *MOMENT_ARRAYS):  # like `numpy.savez_compressed`, which needs all of them at once
                     with packed.open(f"{key}.npy", "w", force_zip64=True) as member:
                         parts = [texts[key]] if key in texts else [getattr(a, key) for a in self.moments]
                         np.lib.format.write_array(member, parts[0] if len(parts) == 1 else np.concatenate(parts))
@@ -293,9 +293,9 @@ class Partial:
         self.remove()
 
     def remove(self) -> None:
-        """Remove the partial run, whole or not at all."""
+        """Remove the partial run completely or not at all."""
         place = Path(os.path.abspath(self.place))
-        if place.is_dir():  # ours, or of a run that was to be overwritten
+        if place.is_dir():  # ours, or that of a run that was to be overwritten
             with disk.beside(place) as work:
                 place.rename(work / "new")
         self.close()
@@ -303,14 +303,14 @@ class Partial:
         disk.kept.clear()
 
     def close(self) -> None:
-        """Let other processes go on with it."""
+        """Release the lock, so that other processes can resume it."""
         if self._lock is not None:
             os.close(self._lock)
         self._lock = None
 
 
 def beside(folder: Path) -> Path:
-    """Where the partial run of a folder is."""
+    """The path of the partial run of a folder."""
     return folder.with_name(folder.name + SUFFIX)
 
 
@@ -332,7 +332,7 @@ def opened(place: Path, mode: Literal["r", "r+"] = "r+") -> Any:
 
 @dataclass(frozen=True)
 class Kept:
-    """What a partial run holds: its attributes, and for each range of paths arrays and ``channels``, in work order."""
+    """The content of a partial run: attributes, and for each range of paths arrays and ``channels``, in work order."""
 
     attributes: Record
     ranges: dict[str, Record]
@@ -344,12 +344,12 @@ def is_partial(place: Path) -> bool:
 
 
 def read(place: Path) -> Kept:
-    """Read a partial run, which may be growing."""
+    """Read a partial run, which may still be growing."""
     group = opened(place, mode="r")
     found = {}
     for name in _ranges(group):
         part = group[name]
-        paths = part["paths"][:]  # first: a row that it counts is there
+        paths = part["paths"][:]  # first: the rows that it counts are complete
         arrays = {"light": part["light"][:], "spread": part["spread"][:], "paths": paths}
         found[name] = {**arrays, "channels": _channels(part.attrs["channels"])}
     return Kept(dict(group.attrs), found)
@@ -360,7 +360,7 @@ def _name(paths: range) -> str:
 
 
 def _ranges(group: Any) -> list[str]:
-    """Names of the ranges of paths in a group, in their order."""
+    """Names of the ranges of paths in a group, in order."""
     return sorted((name for name, _ in group.groups() if "-" in name), key=lambda name: int(name.split("-")[0]))
 
 

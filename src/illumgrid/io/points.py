@@ -1,4 +1,4 @@
-"""Densities of points, from arrays and from files, and their need of memory."""
+"""Densities of points, from arrays and from files, and the check of their memory."""
 
 import os
 from collections.abc import Sequence
@@ -14,7 +14,7 @@ from illumgrid.field.volume import Volume
 from illumgrid.io import needs
 
 FILE = "file"
-"""In place of a periodic cell: the one that the file of the points says."""
+"""In place of a periodic cell: use that of the file of the points."""
 
 
 def density(
@@ -51,7 +51,7 @@ def density(
     Raises
     ------
     BadInput
-        If an argument is not as said, or the voxels need more memory than is free.
+        If an argument is invalid, or the voxels need more memory than is free.
     """
     at, mass = checked_points(points, weights)
     brick = None if cell is None or np.ndim(cell) != 2 else Brick.of(cell)
@@ -84,7 +84,7 @@ def density_of_file(
     columns : (3,) sequence of str, optional
         Columns of the coordinates.
     cell : "file", float, (3,) or (3, 3) array_like, optional
-        A periodic cell, or the one that the file says.
+        A periodic cell, or that of the file.
     """
     from illumgrid.io.readers.points import read_points
 

@@ -1,6 +1,6 @@
-"""What ``run.json`` says of a finished run: scene, levels, lattices and recipe, and which arrays lie in the EXR file.
+"""``run.json`` of a finished run: scene, levels, lattices and recipe, and the arrays in the EXR file.
 
-Nothing in it is believed: shapes, names and counts are checked before an array is read or made.
+Nothing in it is trusted: shapes, names and counts are checked before an array is read or allocated.
 """
 
 import json
@@ -22,9 +22,9 @@ from illumgrid.io import grids as grid_parts
 from illumgrid.io.elsewhere import Source
 
 FORMAT = 4
-"""1 had RGB only; to 2, fields were float32, x fastest, and one checksum covered both files; to 3, grids were dense."""
+"""1 had RGB only; up to 2, fields were float32, x fastest, with one checksum for both files; up to 3, dense grids."""
 PLACE = ("origin", "spacing", "direction")
-BINS = 64  # of the histogram of a field
+BINS = 64  # bins of the histogram of a field
 MOST_ROWS = 64
 LOOKS = ("transmission", "translucent")
 EDGES = ("corner", "edge_u", "edge_v")
@@ -40,10 +40,10 @@ Record = dict[str, Any]  # the content of run.json
 
 @dataclass(frozen=True, eq=False)
 class Stored:
-    """What a finished folder holds, except the picture: one grid and one column of levels for every field.
+    """The content of a finished folder, except the picture: one grid and one column of levels for every field.
 
-    The recipe says how the run was made, in what JSON has: finite numbers, text, booleans, None, lists, dicts of text.
-    With a `source` the fields are not written: the folder refers to it.
+    The recipe states how the run was made, in types of JSON: finite numbers, text, booleans, None, lists, dicts by
+    text. With a `source` the fields are not written: the folder refers to it.
     """
 
     scene: Scene
@@ -60,11 +60,11 @@ class Stored:
         if len(self.walls) != len(self.scene.quads):
             raise BadInput(f"{len(self.walls)} wall textures came for {len(self.scene.quads)} quads; expected one each")
         if table.ndim != 2 or not table.size or table.shape[1] != fields or not np.isfinite(table).all():
-            raise BadInput(f"the level table has shape {table.shape}; expected finite isovalues, one column a field")
+            raise BadInput(f"the level table has shape {table.shape}; expected finite isovalues, one column per field")
 
 
 def record_of(stored: Stored) -> Record:
-    """All but the arrays, as JSON reads it back (it keeps floats exactly, makes tuples lists and keys text)."""
+    """The record without arrays, as JSON returns it (it keeps floats exactly, makes tuples lists and keys text)."""
 
     def lattice(of: Lattice) -> Record:
         return {"shape": of.shape} | {name: getattr(of, name).tolist() for name in PLACE}
@@ -111,7 +111,7 @@ def record_of(stored: Stored) -> Record:
 
 
 def _lit(grid: IlluminationGrid) -> float:
-    """Share of the nodes that have light of their own; of the coarsest of several densities."""
+    """Share of the nodes that have light of their own; of several densities, that of the coarsest."""
     step = int(grid.held.layout.step[0])
     return len(grid.lit) / float(np.prod((np.array(grid.spec.shape) - 1) // step + 1))
 
@@ -132,7 +132,7 @@ def _light(about: Record) -> Light:
 
 
 def read_record(path: Path) -> Record:
-    """The content of ``run.json``, of a format known here."""
+    """The content of ``run.json``, if its format is known here."""
     record: Record = json.loads(path.read_text(encoding="utf-8"))
     if record["format"] not in range(1, FORMAT + 1):
         raise BadInput(f"its format is {record['format']!r}; illumgrid {version('illumgrid')} reads 1 to {FORMAT}")
@@ -152,7 +152,7 @@ def _field_volume(record: Record, about: Record, plan: Plan, parts: exr.Parts) -
 
 
 def rebuild(record: Record, plan: Plan, parts: exr.Parts, volumes: list[Volume] | None) -> Stored:
-    """What a record and the arrays of its parts describe; `volumes` take the place of fields that were not written."""
+    """The content of a folder, from its record and the arrays of its parts; `volumes` are fields that are not in it."""
     grids, fields = [], []
     for number, about in enumerate(record["scene"]["fields"]):
         where, channels = record["grids"][about["name"]], _channels(record, f"light/{about['name']}")
@@ -181,7 +181,7 @@ def rebuild(record: Record, plan: Plan, parts: exr.Parts, volumes: list[Volume] 
 
 
 def _rows(record: Record, field: str) -> list[str]:
-    """Names of the parts that hold a field's grid at places of the sweep, if its level is held."""
+    """Names of the parts that hold a field's grid at positions of the sweep, if its level is held."""
     count = record["grids"][field].get("rows", 0)
     if not (isinstance(count, int) and 0 <= count <= MOST_ROWS and count != 1):
         raise BadInput(f"the rows of field {field!r} are {str(count)[:40]!r}; expected 2 to {MOST_ROWS}, or none")

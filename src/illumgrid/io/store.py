@@ -62,11 +62,11 @@ def claim(folder: str | os.PathLike[str], overwrite: bool) -> None:
 
 
 def _refuse_foreign(place: Path, folder: str | os.PathLike[str]) -> None:
-    """Raise unless `place`, which the user calls `folder`, is empty or a finished run and nothing besides."""
+    """Raise unless `place`, which the user calls `folder`, is empty or contains only a finished run."""
     plain = {p.name: p.is_file() and not p.is_symlink() for p in place.iterdir()}
     foreign = sorted(name for name in plain if not plain[name] or name not in (EXR, RUN, PREVIEW, MOMENTS))
     if plain and not {EXR, RUN} <= plain.keys():
-        foreign = foreign or sorted(plain)  # not a run: a file that happens to have such a name
+        foreign = foreign or sorted(plain)  # not a run, but a file that happens to have such a name
     if foreign:
         raise BadInput(f"{folder} holds {foreign[0]!r}, which is not of a finished run; {ELSEWHERE}")
 
@@ -131,7 +131,7 @@ def _move(fresh: Path, place: Path, old: Path, overwrite: bool) -> None:
             place.rmdir()
         if overwrite and place.exists():
             place.rename(old)
-            _refuse_foreign(old, place)  # what came in since we looked
+            _refuse_foreign(old, place)  # what appeared there since the check
         fresh.rename(place)
     except BaseException as reason:
         with suppress(OSError):
@@ -142,7 +142,7 @@ def _move(fresh: Path, place: Path, old: Path, overwrite: bool) -> None:
 
 
 def read(folder: str | os.PathLike[str]) -> Stored:
-    """Read a finished run, trusting nothing.
+    """Read a finished run; nothing in it is trusted.
 
     Raises
     ------
@@ -170,7 +170,7 @@ def read(folder: str | os.PathLike[str]) -> Stored:
 
 
 def describe(folder: str | os.PathLike[str]) -> Record:
-    """What ``run.json`` says, its pixels unread: of every field also extremes, histogram and share of lit nodes.
+    """The content of ``run.json`` without the pixels: for every field also extremes, histogram and share of lit nodes.
 
     Raises
     ------
@@ -227,5 +227,5 @@ def _write_exr(path: Path, stored: Stored) -> None:
 
 
 def is_run(folder: str | os.PathLike[str]) -> bool:
-    """Whether a folder looks like a finished run, rather than one of DICOM slices."""
+    """Whether a folder looks like a finished run, and not like one of DICOM slices."""
     return (Path(folder) / RUN).is_file() or (Path(folder) / EXR).is_file()

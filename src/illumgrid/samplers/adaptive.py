@@ -122,7 +122,7 @@ def adaptive_rows(scene: Scene, count: int, topology: float = TOPOLOGY) -> Float
         at, change = critical_values(field)
         changes += np.histogram(at, rising, weights=np.abs(change))[0][::order]
     if not step_length.any():
-        return level_table(scene, count).table  # no cell is crossed: no basis for a choice
+        return level_table(scene, count).table  # no cell is crossed: nothing to choose by
     changes[step_length == 0] = 0
     share = step_length / step_length.sum()
     if changes.any():

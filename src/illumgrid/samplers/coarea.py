@@ -1,4 +1,4 @@
-"""Points that are uniform by area on level sets, each on one of its own: no surface is extracted."""
+"""Points uniform by area on level sets, each on its own level set: no surface is extracted."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,13 +12,13 @@ from illumgrid.field.storing import read_at_random
 from illumgrid.field.volume import AT_ONCE, Floats, cell_gradient, index_to_world, interpolate
 from illumgrid.transport.samples import Queries, join_queries
 
-_LOOKED_AT = 1 << 24  # voxels of a field of which all are looked at
-_AT_ONCE = 1 << 20  # cells of which the chances are held
+_LOOKED_AT = 1 << 24  # voxels of a field that is examined as a whole
+_AT_ONCE = 1 << 20  # cells whose probabilities are held
 _STEPS = 64  # of the isovalue, within which points are uniform by area
 
 
 def points_on_level_sets(scene: Scene, points: int, seed: tuple[int, ...]) -> Queries:
-    """About `points` for each field, as many from each of 64 equal steps of its range.
+    """About `points` points for each field, with equal numbers from each of 64 equal steps of its range.
 
     By the co-area formula, points of a volume weighted by |∇h| are uniform by area on the level sets through them;
     weights that add up to the same within each step make them uniform in the isovalue.
@@ -40,12 +40,12 @@ def points_on_level_sets(scene: Scene, points: int, seed: tuple[int, ...]) -> Qu
         total = np.bincount(step, weight, minlength=_STEPS)
         weight = weight / np.where(total > 0, total, 1.0)[step]
         if weight.any():
-            # Systematic draws from the points in order of isovalue: the same number from every step, or nearly.
+            # Systematic draws from the points in order of isovalue: about the same number from every step.
             order = np.argsort(step, kind="stable")
             mass = np.cumsum(weight[order]) / weight.sum()
             chosen = order[np.searchsorted(mass, (np.arange(points) + random.random()) / points).clip(0, len(mass) - 1)]
             world = index_to_world(field.volume, index[np.unique(chosen)])
-            with read_at_random([field.volume.stored]):  # few, and far from each other
+            with read_at_random([field.volume.stored]):  # few, and far apart
                 found.append(Queries.at(scene, world, field=number, first_id=number << 40))
     if not found:
         return Queries.at(scene, np.zeros((0, 3)))
@@ -54,7 +54,7 @@ def points_on_level_sets(scene: Scene, points: int, seed: tuple[int, ...]) -> Qu
 
 
 def _in_order(look: Callable[[Floats], Floats], index: Floats) -> Floats:
-    """What is found at indices (n, 3), which are looked at slab by slab: a field that is paged is then read once."""
+    """The values found at indices (n, 3), looked up slab by slab: a field that is paged is then read once."""
     order = np.argsort(index[:, 0])
     found = look(index[order])
     back = np.empty_like(found)
@@ -64,22 +64,22 @@ def _in_order(look: Callable[[Floats], Floats], index: Floats) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class _Cells:
-    """Voxel cells that the range crosses, and chances that give every step of the isovalue as many.
+    """Voxel cells that the range crosses, and probabilities with which each step of the isovalue gets equally many.
 
-    Chosen all alike, the few cells around a small level set would hardly be met.
+    With equal probabilities, the few cells around a small level set would hardly be chosen.
     """
 
     number: NDArray[np.integer]  # (n,) flat
     first: NDArray[np.int8]  # (n,) step of the range that the cell crosses first
-    last: NDArray[np.int8]  # (n,) one behind the last
-    rare: Floats  # (steps + 1,) sum over the steps before of one part in so many cells that cross them
+    last: NDArray[np.int8]  # (n,) one beyond the last
+    rare: Floats  # (steps + 1,) cumulative over the steps: 1 over the number of cells that cross each
 
     def chance(self, some: slice | NDArray[np.integer]) -> Floats:
-        """Chances of some cells."""
+        """Probabilities of some cells."""
         return np.asarray(self.rare[self.last[some]] - self.rare[self.first[some]])
 
     def drawn(self, shares: Floats) -> NDArray[np.int64]:
-        """The cell at each share (m,) of the sum of all chances, which is never held as a whole."""
+        """The cell at each share (m,) of the sum of all probabilities, which is never held as a whole."""
         ends, total = [], 0.0
         begins = range(0, len(self.number), _AT_ONCE)
         for begin in begins:
@@ -93,14 +93,14 @@ class _Cells:
         return found.clip(0, len(self.number) - 1)
 
     def _upto(self, begin: int, before: float) -> Floats:
-        """Sums of the chances up to each of some cells; `before` is that of the cells in front of them."""
+        """Cumulative probabilities up to each of some cells; `before` is the sum for the cells ahead of them."""
         chance = self.chance(slice(begin, begin + _AT_ONCE))
         chance[0] += before
         return np.cumsum(chance, out=chance)
 
 
 def _cells_by_step(field: Field, random: np.random.Generator) -> _Cells:
-    """The cells that the range crosses; in a volume of more than `_LOOKED_AT` voxels, those of some columns."""
+    """The cells that the range crosses; for a volume of more than `_LOOKED_AT` voxels, those of some columns."""
     nx, ny, nz = field.volume.shape
     many, at_once = (nx - 1) * (ny - 1), max(1, AT_ONCE // (4 * nz))
     columns = np.arange(many)
@@ -112,7 +112,7 @@ def _cells_by_step(field: Field, random: np.random.Generator) -> _Cells:
         many_in += np.bincount(first, minlength=_STEPS + 1) - np.bincount(last, minlength=_STEPS + 1)
     rare = np.concatenate([[0.0], np.cumsum(1.0 / np.maximum(np.cumsum(many_in), 1))])
     each = [list(of) for of in zip(*parts)]
-    del parts  # there are as many cells as voxels that are looked at: their parts go as they are joined
+    del parts  # as many cells as voxels examined: their parts are freed as they are joined
     number, begin, end = (np.concatenate(each.pop(0)) for _ in range(3))
     return _Cells(number, begin, end, rare)
 
@@ -120,7 +120,7 @@ def _cells_by_step(field: Field, random: np.random.Generator) -> _Cells:
 def _crossed(
     field: Field, columns: NDArray[np.int64]
 ) -> tuple[NDArray[np.integer], NDArray[np.int8], NDArray[np.int8]]:
-    """Of the cells in some columns along the last axis, those that the range crosses: number, first step, last + 1."""
+    """Cells that the range crosses, of some columns along the last axis: number, first step, last step + 1."""
     (lowest, highest), (_, ny, nz) = map(float, field.stored_range), field.volume.shape
     x, y = np.divmod(columns, ny - 1)
     steps = []

@@ -22,15 +22,15 @@ from illumgrid.transport.samples import Queries, Samples, join_queries
 _BATCH = 1 << 14
 
 Part = tuple[NDArray[np.intp], tuple[int, ...], Floats, Callable[[NDArray[np.int64]], Queries]]
-"""Which points lie in a lattice, its shape, where (n, 3) they lie in it, and what asks at nodes by their numbers."""
+"""Which points lie in a lattice, its shape, their places (n, 3) in it, and a function from node numbers to queries."""
 
 
 def at_nodes(scene: Scene, field: int, spec: GridSpec, nodes: NDArray[np.integer]) -> Queries:
-    """Queries of `Direct` at the nodes with these flat numbers, which are their ids."""
+    """Queries of `Direct` at the nodes with these flat numbers, which become their ids."""
     own, points = scene.fields[field], spec.nodes(nodes)
     index = world_to_index(own.volume, points)
     isovalues = interpolate(own.volume, index)
-    # A rim node represents the end of the range: light of a level outside the sweep would be wrong there (at the value
+    # A rim node stands for the end of the range: light of a level outside the sweep would be wrong there (at the value
     # of an empty background everything is solid, and dark). A projection moves at most one voxel, so a node of a
     # coarser grid moves there over intermediate isovalues.
     level = np.clip(isovalues, *own.range)
@@ -48,10 +48,10 @@ def at_nodes(scene: Scene, field: int, spec: GridSpec, nodes: NDArray[np.integer
 
 @dataclass(frozen=True)
 class Direct:
-    """One query on each grid node that a sweep can reach, on the level set through the node itself.
+    """One query on each grid node that the sweep can reach, on the level set through the node itself.
 
-    A rim node, whose own isovalue lies outside the range, is queried at the nearest end of the range instead, from the
-    point of that level set to which the gradient leads.
+    For a rim node, whose own isovalue lies outside the range, the query is moved along the gradient onto the level set
+    at the nearest end of the range.
     """
 
     name: ClassVar[str] = "direct"
@@ -65,9 +65,9 @@ class Direct:
 
 
 class NodeQueries(Queries):
-    """The queries of `Direct` at nodes of one field, of which only the nodes' numbers are kept: 4 bytes each.
+    """The queries of `Direct` at nodes of one field, stored as the nodes' numbers: 4 bytes each.
 
-    They are at all nodes that a sweep can reach, or at those whose numbers are given.
+    At all nodes that the sweep can reach, or at those whose numbers are given.
 
     Rows of it are plain queries; `point`, `normal` and `level` are computed on each access, some nodes at a time.
     """
@@ -89,7 +89,7 @@ class NodeQueries(Queries):
     def __getitem__(self, rows: slice | NDArray[np.bool_] | NDArray[np.integer]) -> Queries:
         node = self.node[rows].astype(np.int64)
         parts = [node[first : first + _BATCH] for first in range(0, len(node), _BATCH)] or [node]
-        found = [at_nodes(self.scene, self.field, self.spec, part) for part in parts]  # what is computed takes more
+        found = [at_nodes(self.scene, self.field, self.spec, part) for part in parts]  # the results need more memory
         return found[0] if len(found) == 1 else join_queries(found)
 
     def _all(self, name: str) -> Floats:
@@ -101,7 +101,7 @@ class NodeQueries(Queries):
 
     @property
     def id(self) -> NDArray[np.uint64]:
-        """Flat numbers of the nodes, with that of the field above them."""
+        """Flat numbers of the nodes, with the number of the field in the upper bits."""
         return self.node.astype(np.uint64) | np.uint64(self.field << 40)
 
     @property
@@ -127,15 +127,15 @@ class NodeQueries(Queries):
 
 @dataclass(frozen=True, eq=False)
 class Corners:
-    """The nodes, or texels, that a lookup at some points reads, in light that is never computed as a whole."""
+    """The nodes, or texels, that lookups at some points read, of a grid that is never computed as a whole."""
 
     asked: Queries  # one for each such node
-    row: NDArray[np.int64]  # (n, 8): where in `asked` the nodes of each point are
-    weight: Floats  # (n, 8): trilinear
+    row: NDArray[np.int64]  # (n, 8): positions in `asked` of the nodes of each point
+    weight: Floats  # (n, 8): trilinear weights
 
     @classmethod
     def of(cls, points: int, parts: Iterable[Part]) -> "Corners":
-        """Gather the nodes of so many points from parts: a lattice each, which some of the points lie in."""
+        """Gather the nodes of all points from parts, one lattice for some of the points each."""
         row, weight = np.zeros((points, 8), np.int64), np.zeros((points, 8))
         found, first = list[Queries](), 0
         for own, shape, index, ask in parts:
@@ -150,7 +150,7 @@ class Corners:
     def read(self, samples: Samples) -> tuple[Floats, NDArray[np.bool_]]:
         """Light (n, 3) at the points, and whether (n,) all of their nodes have light of their own.
 
-        A node without light counts as the mean of the others, as one that is filled from a neighbour does, nearly.
+        A node without light counts as the mean of the others, which is close to one filled from a neighbour.
         """
         lit = (samples.paths > 0)[self.row] & (self.weight > 0)
         weight = np.where(lit, self.weight, 0.0)

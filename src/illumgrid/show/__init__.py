@@ -26,7 +26,7 @@ _HOME = {name: home for home, names in _HOMES.items() for name in names}
 
 
 def __getattr__(name: str) -> Any:
-    """Import a name where it is first used: the engines and Pillow are heavy."""
+    """Import a name on first use: the engines and Pillow take long to import."""
     if name not in _HOME:
         raise AttributeError(f"module 'illumgrid.show' has no attribute {name!r}")
     return getattr(importlib.import_module(f"illumgrid.{_HOME[name]}"), name)

@@ -1,6 +1,6 @@
 """The illumination grid as a block of light, whole or with the corner towards the eye cut out (Figure 6).
 
-Nothing but light is drawn: where no isosurface of the range passes one looks through, to the isosurface behind.
+Only light is drawn: places that no isosurface of the range passes are transparent, so that an isosurface behind shows.
 """
 
 from dataclasses import dataclass
@@ -19,8 +19,8 @@ from illumgrid.tone import curve
 
 NEAR = 1e-9  # index units: a ray this close to the octant that was cut out enters it
 FACES = 0.8, 0.9, 1.0  # tones of faces across, along and above the view from the front, so that edges show
-STEP = 0.7  # nodes, by which a ray looks for light
-HALVINGS = 6  # of such a step, to find where light begins
+STEP = 0.7  # nodes: step of a ray that searches for light
+HALVINGS = 6  # of such a step: precision of the place where light begins
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +76,7 @@ class Block:
     def glow(self) -> NDArray[np.float32]:
         """Light (nx, ny, nz, 4) as it is exposed, and how far the isovalue of a node is within the range, its span 1.
 
-        Holes have the light around them, smoothly: that of the nearest node would show as shards.
+        Holes have the light of their surroundings, smoothed: that of the nearest node would show as shards.
         """
         light = self.shown.light
         grid, field = light.grids[self.number], light.scene.fields[self.number]

@@ -1,4 +1,4 @@
-"""The camera: which way is up, where the eye is, and what the picture holds."""
+"""The camera: the up direction, the position of the eye, and the extent of the picture."""
 
 import json
 import math
@@ -14,7 +14,7 @@ from illumgrid.field.upright import axes_of, up_of
 from illumgrid.field.volume import Floats, box_corners, index_to_world, slabs
 
 HALF_ANGLE = 0.27  # tangent of half the vertical angle of view, 30 degrees in all
-MARGIN = 1.08  # the picture is this much larger than what it holds
+MARGIN = 1.08  # margin: the picture is this much larger than its content
 VIEWS = {
     "front": (0.0, 0.0), "back": (180.0, 0.0), "right": (90.0, 0.0), "left": (-90.0, 0.0),
     "top": (0.0, 90.0), "bottom": (0.0, -90.0), "iso": (45.0, math.degrees(math.asin(1 / math.sqrt(3)))),
@@ -97,7 +97,7 @@ def _column_ends(values: NDArray[Any], level: np.float64, sign: float) -> Floats
         solid = part >= level if sign > 0 else part <= level
         x, y = np.nonzero(solid.any(axis=2))
         for step, end in ((-1, solid.argmax(axis=2)[x, y]), (1, last - solid[:, :, ::-1].argmax(axis=2)[x, y])):
-            # From the level, counted inward: 0 at a cap, where the volume ends.
+            # The level, counted inward: 0 at a cap, where the volume ends.
             inner, outer = (sign * part[x, y, k].astype(float) for k in (end, np.clip(end + step, 0, last)))
             share = np.divide(inner - sign * level, inner - outer, out=np.zeros_like(inner), where=inner > outer)
             found.append(np.stack([x + slab.start, y, end + step * share], axis=1))
@@ -105,7 +105,7 @@ def _column_ends(values: NDArray[Any], level: np.float64, sign: float) -> Floats
 
 
 def outline_of(scene: Scene, row: Floats) -> Floats:
-    """World points (m, 3) whose hull is that of walls, and of the solids under a row of levels (volumes if none)."""
+    """World points (m, 3) whose hull is that of walls and of the solids under a row of levels (else volumes)."""
     found = []
     for field, isovalue in zip(scene.fields, row):
         level = np.float64(field.volume.to_stored(isovalue))
@@ -114,17 +114,17 @@ def outline_of(scene: Scene, row: Floats) -> Floats:
             found.append(index_to_world(field.volume, np.insert(ends[:, :2], axis, ends[:, 2], axis=1)))
     if not sum(map(len, found)):
         found = [box_corners(f.volume) for f in scene.fields]
-    for quad in () if scene.open else scene.quads:  # a room is seen whole, a floor under a sky goes on
+    for quad in () if scene.open else scene.quads:  # a room must be seen whole; a floor under a sky continues anyway
         found.append(quad.corner + np.array([np.zeros(3), quad.edge_u, quad.edge_v, quad.edge_u + quad.edge_v]))
     return np.concatenate(found)
 
 
 def widest_row(scene: Scene) -> Floats:
-    """Isovalues (F,) under which the solid of every field is largest: those of all other settings lie within."""
+    """Isovalues (F,) under which the solid of every field is largest; all other settings lie within."""
     return np.array([field.widest for field in scene.fields])
 
 
-ZOOM = 1e6  # the largest: beyond it, and below its inverse, nothing is seen, and tangents overflow
+ZOOM = 1e6  # the largest zoom: beyond it, and below its inverse, nothing is visible, and tangents overflow
 
 
 def fit_camera(
@@ -137,7 +137,7 @@ def fit_camera(
     up: str | None = None,
     roll: float = 0.0,
 ) -> Camera:
-    """Camera that looks at the solids under one row of levels, or several, and just holds them.
+    """Camera that looks at the solids under one or several rows of levels, and just contains them.
 
     Parameters
     ----------
@@ -147,14 +147,14 @@ def fit_camera(
     aspect : float
         Width of the picture over its height.
     view : str or (azimuth, elevation), optional
-        By default from the front, 30 degrees from the right and 18 from above; what is flat is seen from above, and
-        into a closed scene one looks straight.
+        By default from the front, 30 degrees from the right and 18 from above; flat objects are seen from above, and
+        closed scenes straight from the front.
     zoom : float
-        Enlarges the middle of the picture.
+        Magnification about the middle of the picture.
     up : {"x", "y", "z", "-x", "-y", "-z"}, optional
-        World direction that is up, by the array axis nearest to it; by default as `up_of` says.
+        World direction that is up, by the array axis nearest to it; by default that of `up_of`.
     roll : float
-        Degrees by which the picture is turned clockwise.
+        Degrees by which the picture is rotated clockwise.
     """
     outline = np.concatenate([outline_of(scene, one) for one in np.atleast_2d(row)])
     axes = axes_of(scene.fields[0].volume.direction, up_of(scene) if up is None else up)
@@ -173,9 +173,11 @@ def camera_around(
     zoom: float = 1.0,
     roll: float = 0.0,
 ) -> Camera:
-    """Camera that just holds world points (m, 3), seen from `view` among these `axes` (right, front, up)."""
+    """Camera that just contains world points (m, 3), seen from `view` relative to these `axes` (right, front, up)."""
     if not 1 / ZOOM <= zoom <= ZOOM:
-        raise BadInput(f"the zoom is {zoom}; expected a positive number up to {ZOOM:g}: 2 shows all twice as large")
+        raise BadInput(
+            f"the zoom is {zoom}; expected a positive number up to {ZOOM:g}: 2 shows everything twice as large"
+        )
     if not math.isfinite(roll):
         raise BadInput(f"the roll is {roll}; expected degrees")
     azimuth, elevation = np.radians(angles("front" if view is None else view))
@@ -189,7 +191,7 @@ def camera_around(
 
 
 def _eye(outline: Floats, right: Floats, up: Floats, forward: Floats, aspect: float) -> Floats:
-    """Nearest place from which all of `outline` (m, 3) fits the picture.
+    """Nearest position from which all of `outline` (m, 3) fits into the picture.
 
     Each point p bounds the eye e: |x| <= aspect (z - e_z) tan and |y| <= (z - e_z) tan, with x and y from the axis of
     view. The tightest bounds on either side meet at the farthest forward place.

@@ -1,7 +1,7 @@
 """Light on caps, the flat faces that close a solid at the border of its volume.
 
-Beyond a face of the box there is, where a field stands alone, nothing but the sky: its light is known in closed form,
-one colour for each face. Where walls or other fields stand beyond it, it is not.
+If a field stands alone, only the sky lies beyond a face of its box: the light of the face is known in closed form, one
+colour for each face. If walls or other fields lie beyond it, the light is unknown.
 """
 
 import numpy as np
@@ -14,7 +14,7 @@ from illumgrid.field.volume import Floats, Volume, box_corners, world_to_index
 from illumgrid.grid.channels import RGB, Channels, channels_of, columns_of
 from illumgrid.light import Illumination
 
-_BEYOND = 1e-6  # of the longest side, from which on something lies beyond a face
+_BEYOND = 1e-6  # of the longest side: something beyond a face counts from this distance on
 
 
 def face_normals(volume: Volume) -> Floats:
@@ -55,7 +55,7 @@ def channels_on_caps(light: Illumination, number: int) -> tuple[Floats, Channels
 
 
 def light_on_caps(light: Illumination, number: int) -> NDArray[np.float32]:
-    """Irradiance (6, 3) of the faces of a field's box as it is shown; NaN where the sky is not all that they see."""
+    """Irradiance (6, 3) of the faces of a field's box as it is shown; NaN if they receive more than the sky's light."""
     found, channels = channels_on_caps(light, number)
     result = np.maximum(channels.rgb(found.astype(np.float32)), np.float32(0))  # smooth skies may be negative
     result[~open_faces(light.scene, number)] = np.nan

@@ -1,4 +1,4 @@
-"""Words on a picture: the isovalues it shows, and a scale bar."""
+"""Text on a picture: the isovalues it shows, and a scale bar."""
 
 import math
 from typing import Any
@@ -13,7 +13,7 @@ from illumgrid.show.camera import Camera
 
 Picture = NDArray[np.uint8]
 
-BAR = 0.2  # of the width: a scale bar is the longest round length up to that
+BAR = 0.2  # of the width: the scale bar is the longest round length up to this
 
 
 def isovalues_of(scene: Scene, row: Floats) -> str:
@@ -37,8 +37,8 @@ def labelled(picture: Picture, text: str) -> Picture:
 def scale_bar(picture: Picture, camera: Camera, middle: Floats, volume: Volume) -> Picture:
     """A picture with a bar of a round length in its lower right corner.
 
-    In perspective a length depends on depth: the bar holds at the depth of the world point `middle` (3,). The unit is
-    that of `volume`; without one the bar has world units.
+    In perspective a length depends on depth: the bar is valid at the depth of the world point `middle` (3,). The unit
+    is that of `volume`, or world units if it has none.
     """
     from PIL import Image, ImageDraw
 

@@ -17,17 +17,17 @@ PARTS = {
     "bounces": ("truncated bounces", "#e0a030"),
 }
 SHOWN = 10
-"""Contestants with a colour and a line of the legend of their own; the others are grey dots."""
+"""Contestants with a colour and a line of the legend; the others are grey dots."""
 
 COLUMNS = 4
 """Of the legend."""
 
 LABEL = (45.0, 11.0)
-"""Pixels that a label takes."""
+"""Pixels of a label."""
 
 
 def draw(records: Sequence[dict[str, Any]], shares: Sequence[dict[str, Any]], title: str) -> "Figure":
-    """Figure with the race on the left, and where the error of the direct way comes from on the right."""
+    """Figure with the race on the left, and the sources of the error of `direct` with `nearest` on the right."""
     from matplotlib.figure import Figure
 
     rows = -(-(min(SHOWN + 1, len({r["contestant"] for r in records})) + 3) // COLUMNS)
@@ -35,7 +35,7 @@ def draw(records: Sequence[dict[str, Any]], shares: Sequence[dict[str, Any]], ti
     left, right = figure.subplots(1, 2, width_ratios=(1.55, 1))
     race(left, records)
     parts(right, shares)
-    handles, names = left.get_legend_handles_labels()  # below both: however many there are, they hide nothing
+    handles, names = left.get_legend_handles_labels()  # below both axes, so that it hides nothing however long it is
     figure.legend(handles, names, loc="outside lower center", ncols=COLUMNS, fontsize=8, frameon=False)
     figure.suptitle(title, fontsize=12)
     return figure

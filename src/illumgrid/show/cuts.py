@@ -1,4 +1,4 @@
-"""Clip planes: what lies beyond them is left out of a picture, and the cut shows the data in grey.
+"""Clip planes: parts beyond them are left out of a picture, and the cut shows the data in grey.
 
 Display only: the light is that of the whole solid. Walls stay whole.
 """
@@ -20,9 +20,9 @@ if TYPE_CHECKING:
     from illumgrid.show.shade import Shown
 
 CUT = 5
-"""What a ray meets beside those of `illumgrid.constants`: the inside of a solid, where a plane cuts it."""
+"""In addition to the kinds in `illumgrid.constants`: the inside of a solid at a cut."""
 
-_WINDOW = 0.01, 0.99  # quantiles that are shown black and white
+_WINDOW = 0.01, 0.99  # quantiles that are shown as black and white
 
 
 class Clip(NamedTuple):
@@ -85,7 +85,7 @@ def _left(corners: Floats, clips: Sequence[Clip]) -> bool:
 
 
 def window(field: Field) -> tuple[float, float]:
-    """Values that a cut shows black and white: quantiles of all data, and of those within the largest solid."""
+    """Values that a cut shows as black and white: quantiles of all data, and of those within the largest solid."""
     stored = field.volume.stored
     some = field.volume.in_units(stored.reshape(-1)[:: max(1, stored.size // 200_000)])
     solid = some[field.solid(some, field.widest)]

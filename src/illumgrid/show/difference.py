@@ -1,4 +1,4 @@
-"""What an eye would see of an error: a picture at an unseen isovalue against the converged one, by FLIP."""
+"""The visible effect of an error: a picture at an unseen isovalue against the converged one, by FLIP."""
 
 import importlib.util
 from collections.abc import Callable
@@ -18,20 +18,20 @@ from illumgrid.show.engines.software import SIDE
 from illumgrid.transport.samples import Queries
 from illumgrid.transport.tracer import Tracer
 
-PLACE = 0.437  # in the sweep, where the picture is taken: no sampler in equal steps asks there
-PATHS = 64  # from every point of the converged picture
+PLACE = 0.437  # position in the sweep of the picture: samplers in equal steps have no level there
+PATHS = 64  # paths from every point of the converged picture
 
 
 @dataclass(frozen=True, eq=False)
 class Shown(Illumination):
-    """Light with an exposure of its own, the same for all that are compared. Walls are black."""
+    """Light with a fixed exposure, the same for all that are compared. Walls are black."""
 
     exposure: float = 1.0
 
 
 @dataclass(frozen=True, eq=False)
 class Traced:
-    """In place of a grid: paths from every point that is looked up."""
+    """Replaces a grid: paths from every visible point."""
 
     scene: Scene
     tracer: Tracer
@@ -71,7 +71,7 @@ def studio(
     ----------
     .. [1] P. Andersson et al., "FLIP: a difference evaluator for alternating images", Proc. ACM CGIT 3(2), 2020.
     """
-    height = int(np.sqrt(paths / PATHS / SIDE**2 / (4 / 3) / 0.4))  # a surface covers some 40 % of a picture
+    height = int(np.sqrt(paths / PATHS / SIDE**2 / (4 / 3) / 0.4))  # a surface covers about 40 % of a picture
     height = min(240, height // 12 * 12)
     if height < 48 or importlib.util.find_spec("flip_evaluator") is None:
         return None

@@ -1,9 +1,9 @@
-"""Exact pictures: rays from what a pixel shows gather light, and blend with the lookup by what is known of each.
+"""Exact pictures: rays from the visible points gather light, which is blended with the lookup by their accuracies.
 
 Under an open sky a gathered ray is reflected once and ends at its second hit, in the light that grids and walls hold
-there: what they are off enters through two reflections only, averaged over hemispheres, and shadows are as sharp as the
-pixels. In a closed room it ends at its first hit: there the second brings more noise than it takes away error, and
-takes as long again. See `illumgrid.grid.cache`, and the docs for figures.
+there: their error enters only through two reflections, averaged over hemispheres, and shadows are as sharp as the
+pixels. In a closed room it ends at its first hit: there a second would add more noise than it removes error, and would
+take as long again. See `illumgrid.grid.cache`, and the docs for figures.
 """
 
 from collections.abc import Callable, Iterator
@@ -36,8 +36,8 @@ FEWEST_TRUST, MOST_TRUST = 4.0, 4096.0
 """Bounds on the number of gathered paths that a lookup is worth."""
 
 _PILOT_RAYS, _PILOT_PATHS, _PILOT_LEAST = 4096, 16, 64
-_LEAST_SHAPE = 0.1  # of a lookup's variance over the usual one: grids do not know of all that they miss
-_FAR = 100.0  # times the median of a surface's known variances: few nodes that know nothing do not tell what is usual
+_LEAST_SHAPE = 0.1  # least ratio of a lookup's variance to the usual one: grids do not know all of their errors
+_FAR = 100.0  # times the median of a surface's known variances: excludes nodes without an error
 _BAND = 1 << 17  # sub-samples that are traced together: bounds the memory
 
 
@@ -50,7 +50,7 @@ class Exact:
     paths : int
         Rays from each pixel.
     full : bool
-        Paths go on to their ends, and no lookup enters: the reference, slow.
+        Trace paths to their ends and use no lookup: the reference, slow.
     """
 
     paths: int
@@ -58,15 +58,15 @@ class Exact:
 
     def __post_init__(self) -> None:
         if not 1 <= self.paths <= MOST_PATHS:
-            raise BadInput(f"{self.paths} paths a pixel were asked for; expected 1 to {MOST_PATHS}")
+            raise BadInput(f"{self.paths} paths per pixel were asked for; expected 1 to {MOST_PATHS}")
 
 
 def cache_at(light: Illumination, share: float) -> Cache:
-    """The light as a cache for one place in the sweep, 0 to 1: that of held levels is taken there."""
+    """The light as a cache for one position in the sweep, 0 to 1, at which the light of held levels is taken."""
     held = [grid if not grid.rows else _mixed(grid, share) for grid in light.grids]
     cache = cache_of(light.scene, held, light.walls, after=int(light.scene.open))
     for number, field in enumerate(light.scene.fields):
-        if field.isovalue is not None:  # a stretch about its level in which that has the same place
+        if field.isovalue is not None:  # a stretch around its level, in which this has the same position
             cache.sweep[number] += np.array([-share, 1.0 - share]) * max(1.0, abs(cache.sweep[number, 0]))
     return cache
 
@@ -82,9 +82,9 @@ def _mixed(grid: IlluminationGrid, share: float) -> IlluminationGrid:
 def tracer_of(
     light: Illumination, full: bool, share: float = 0.5
 ) -> tuple["Callable[..., tuple[Colors, NDArray[np.int32]]]", int]:
-    """What answers queries, with irradiance (n, 3) in the mix of the light and the paths walked (n,), and its bounces.
+    """A function that answers queries, with irradiance (n, 3) in the mix of the light and paths (n,); and its bounces.
 
-    It is kept with the light, for further pictures; if levels are held, for those at one place in the sweep.
+    It is kept with the light for further pictures; if levels are held, for those at one position in the sweep.
     """
     from illumgrid.backends.numba_ import Numba
     from illumgrid.transport.tracer import prepare
@@ -95,7 +95,7 @@ def tracer_of(
     if key not in light.__dict__:
         if full:
             tracer = prepare(Numba(), light.scene)
-            bounces = 2 * enough_bounces(light.scene, tracer)[0]  # of what was left out a square is left out
+            bounces = 2 * enough_bounces(light.scene, tracer)[0]  # twice as many omit its square
         else:
             tracer = prepare(Numba(), light.scene, cache_at(light, share))
             bounces = int(light.recipe.get("bounces", 8)) + 2
@@ -111,7 +111,7 @@ def tracer_of(
 
 
 def looked_up(shown: Shown, hits: Hits) -> tuple[Colors, Floats]:
-    """Irradiance (n, 3) that lookups find where rays hit, and its variance (n,) as grids know it, 1 on walls."""
+    """Irradiance (n, 3) of lookups where rays hit, and its variance (n,) by the grids' error bars, 1 on walls."""
     light, variance = np.zeros((len(hits.what), 3), np.float32), np.ones(len(hits.what))
     for k, grid in enumerate(shown.light.grids):
         lit = hits.lit(k)
@@ -155,7 +155,7 @@ class Gathering:
 
     @cached_property
     def seed(self) -> int:
-        """Of paths that have nothing in common with those of the grids."""
+        """Seed of paths that are independent of those of the grids."""
         return shifted_seed(int(self.shown.light.recipe.get("seed", 0)), 2**61)
 
     def asked(self, hits: Hits, rows: NDArray[np.int64], ids: NDArray[np.uint64]) -> Queries:
@@ -165,12 +165,13 @@ class Gathering:
 
     @cached_property
     def trust(self) -> Floats:
-        """Variance of a ray and of a lookup, and that which grids know of, in the mean over each surface: (F + Q, 3).
+        """Mean variances over each surface, (F + Q, 3): of a ray, of a lookup, and of a lookup by its error bars.
 
-        From rays of their own at points spread over the picture. Weights that depended on the rays they weigh would
-        darken it: a pixel that no ray found bright would count as known. Two independent answers G and G' for the
-        lookup L tell both apart: the mean of (G - G')² is twice the variance of each, that of (L - G)(L - G') the
-        variance of L, whatever its cause. Its own standard error is added: little trust where little is known.
+        Measured by separate rays at points spread over the picture. Weights that depend on the rays they weight would
+        darken it: a pixel whose rays all missed the light would seem accurate. Two independent answers G and G' for
+        the lookup L separate the two: the mean of (G - G')² is twice the variance of each, that of (L - G)(L - G') the
+        squared error of L, whatever its cause. The standard error of the latter is added, which reduces trust where
+        it is poorly known.
         """
         solve, _ = tracer_of(self.shown.light, False, self.shown.share)
         random = np.random.default_rng(self.seed)
@@ -203,13 +204,13 @@ class Gathering:
         return np.array([found(own if (own & good).sum() >= _PILOT_LEAST else whole) for own in each])
 
     def worth_of_lookup(self, hits: Hits, known: Floats) -> Floats:
-        """How many gathered rays (n,) each lookup is worth, from what its grid knows of its variance (n,).
+        """Number of gathered rays (n,) that each lookup is worth, from its variance (n,) by the grid's error bars.
 
-        What the grid knows says where lookups are good; how good they are in all, the trial rays say.
+        The error bars show where lookups are better or worse, the trial rays how accurate they are overall.
         """
         ray, lookup, usual = self.trust[np.maximum(hits.number, 0)].T
         shape = np.divide(known, usual, out=np.ones(len(known)), where=usual > 0)
-        variance = lookup * np.clip(shape, _LEAST_SHAPE, 1e12)  # a hole may lie where lookups are not off at all
+        variance = lookup * np.clip(shape, _LEAST_SHAPE, 1e12)  # a lookup may be accurate even at a hole
         worth = np.divide(ray, variance, out=np.full(len(known), np.inf), where=variance > 0)
         return np.asarray(np.clip(worth, FEWEST_TRUST, MOST_TRUST))
 
@@ -219,8 +220,8 @@ class Gathering:
     ) -> Colors:  # fmt: skip
         """Irradiance (n, 3) at sub-samples that belong to these pixels (n,), from sums (n, 3) over so many rays (n,).
 
-        Rays of the sub-samples of a pixel on one surface count together; each keeps what its lookup differs by. Of the
-        `inner` sides (n,) of films lookups, which hold light of the outer ones, are worth little.
+        Rays of the sub-samples of a pixel on one surface are pooled; each sub-sample keeps the difference of its own
+        lookup. On the `inner` sides (n,) of films lookups are worth little, since they hold light of the outer sides.
         """
         light, known = looked_up(self.shown, hits)
         worth = np.zeros(len(pixel)) if self.exact.full else self.worth_of_lookup(hits, known)
@@ -242,12 +243,12 @@ class Gathering:
     def _groups(
         self, hits: Hits, pixel: NDArray[np.int64], inner: NDArray[np.bool_] | None = None
     ) -> NDArray[np.int64]:
-        """Numbers (n,) that sub-samples of a pixel share which show the same side of the same surface."""
+        """Numbers (n,) that are equal for sub-samples of a pixel that show the same side of the same surface."""
         group = pixel * self.surfaces + np.maximum(hits.number, 0)
         return np.asarray(group if inner is None else 2 * group + inner)
 
     def coats(self, layer: Layer, pixel: NDArray[np.int64], total: Colors, count: NDArray[np.int32]) -> Coat:
-        """What coats show at sub-samples, from sums of radiance (n, 3) over so many rays (n,)."""
+        """Radiance of coats at sub-samples, from sums of radiance (n, 3) over so many rays (n,)."""
         rows, group = coated(self.shown, layer), self._groups(layer.hits, pixel)
         rays = np.maximum(np.bincount(group, count), 1)[group[rows]]
         found = [np.bincount(group, total[:, color])[group[rows]] / rays for color in range(3)]
@@ -261,7 +262,7 @@ class Gathering:
 
         steps = list(pairwise([0, *steps_to(self.exact.paths)]))
         depth = LAYERS if any(f.material.transmission for f in self.shown.displayed.fields) else 1
-        kinds = 1 if self.shown.matte else 2  # light, and what coats reflect
+        kinds = 1 if self.shown.matte else 2  # light, and the reflections of coats
         total = np.zeros((kinds, depth, self.height * self.width * SIDE**2, 3), np.float32)
         count = np.zeros(total.shape[:-1], np.int32)
         per_row = self.width * SIDE**2
@@ -283,7 +284,7 @@ class Gathering:
                         lights.append(self.blended(layer.hits, pixel, sums[0][0], sums[1][0], inner))
                     color = software.composed(self.shown, layers, background, lights, coats or None)
                     strips.append(software.averaged(color, self.width))
-                    progress(f"{some[-1][1]} rays a pixel", band.stop, self.height)
+                    progress(f"{some[-1][1]} rays per pixel", band.stop, self.height)
                 yield np.concatenate(strips)
 
     def gather(
@@ -312,7 +313,7 @@ class Gathering:
         self, pool: Executor, layer: Layer, pixel: NDArray[np.int64], first: int, steps: list[tuple[int, int]],
         total: Colors, count: NDArray[np.int32],
     ) -> None:  # fmt: skip
-        """As `gather`, by sight: light of the inner sides of films to total[0], what coats reflect to total[1]."""
+        """Like `gather`, by sight: light of the inner sides of films to total[0], reflections of coats to total[1]."""
         _, place = self._pixels(len(pixel))
         for kind, (lit, factor) in enumerate(((np.flatnonzero(layer.inner), np.pi), (coated(self.shown, layer), 1.0))):
             seed = shifted_seed(self.seed, 3 + kind)
@@ -329,7 +330,7 @@ class Gathering:
                     count[kind, mine] += len(rays)
 
     def _pixels(self, many: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Pixels (n,) that sub-samples belong to, counted from their first row, and places (n,) in them."""
+        """Pixels (n,) of sub-samples, counted from their first row, and positions (n,) within them."""
         y, x = np.divmod(np.arange(many), self.width * SIDE)
         return y // SIDE * self.width + x // SIDE, y % SIDE * SIDE + x % SIDE
 
@@ -347,7 +348,7 @@ class Gathering:
 
 
 def _quarters(steps: list[tuple[int, int]], number: int) -> Iterator[range]:
-    """The paths of these steps that sub-sample `number` of a pixel walks."""
+    """The paths of these steps that sub-sample `number` of a pixel traces."""
     for low, high in steps:
         start, stop = (low + (high - low) * k // SIDE**2 for k in (number, number + 1))
         if start < stop:
@@ -355,5 +356,5 @@ def _quarters(steps: list[tuple[int, int]], number: int) -> Iterator[range]:
 
 
 def steps_to(paths: int) -> list[int]:
-    """Numbers of rays from each pixel at which a picture can be shown: 4, 16, 64, ... and the last."""
+    """Numbers of rays per pixel after which a picture can be shown: 4, 16, 64, ... and the last."""
     return [*(4**k for k in range(1, 11) if 4**k < paths), paths]

@@ -13,7 +13,7 @@ from illumgrid.light import Illumination
 from illumgrid.show.captions import Picture, isovalues_of, labelled
 
 SECONDS, SHORTEST, LONGEST = 4.0, 0.04, 0.5
-"""Seconds that a film lasts, and bounds on those of each frame."""
+"""Duration of a film, and bounds on that of each frame, in seconds."""
 ENDINGS = (".gif", ".webp", ".mp4")
 
 
@@ -26,7 +26,7 @@ def frames(light: Illumination, field: str | None, count: int, draw: Callable[[f
 
 
 def check_ending(name: str, ending: str) -> None:
-    """Raise BadInput unless a film with this ending can be written here; none is a folder of PNG."""
+    """Raise BadInput unless a film with this ending can be written here; no ending means a folder of PNG."""
     if ending and ending not in ENDINGS:
         raise BadInput(
             f"the sweep goes to {name!r}; expected a name that ends in {', '.join(ENDINGS)}, "
@@ -40,9 +40,9 @@ def check_ending(name: str, ending: str) -> None:
 
 
 def film(pictures: Iterable[Picture], count: int, ending: str, out: IO[bytes]) -> None:
-    """Write `count` pictures of one size as a film that starts again at its end: ``.gif``, ``.webp`` or ``.mp4``.
+    """Write `count` pictures of one size as a looping film: ``.gif``, ``.webp`` or ``.mp4``.
 
-    Each is encoded when it comes and then let go: the memory does not grow with their number, but for the encoded film.
+    Each is encoded when it is drawn and then freed: only the encoded film grows in memory.
     """
     shown_for = min(max(SECONDS / count, SHORTEST), LONGEST)
     if ending == ".mp4":
@@ -59,13 +59,13 @@ def film(pictures: Iterable[Picture], count: int, ending: str, out: IO[bytes]) -
 
 
 class _Later:
-    """The pictures after the first as one image of several frames, each taken when Pillow goes to it."""
+    """The pictures after the first as an image of several frames, each drawn when Pillow seeks it."""
 
     def __init__(self, pictures: Iterator[Picture], count: int) -> None:
         self.pictures, self.n_frames = pictures, count
 
     def seek(self, number: int) -> None:
-        """Go on to the next picture."""
+        """Advance to the next picture."""
         self.picture = next(self.pictures)
 
     def __getattr__(self, name: str) -> Any:
@@ -75,7 +75,7 @@ class _Later:
 
 
 def _gif(pictures: Iterable[Picture], count: int, duration: int, out: IO[bytes]) -> None:
-    """Frames of 256 colours that all share: a palette for each would flicker. They wait on the disk for it."""
+    """Frames with a common palette of 256 colours, for which they wait on the disk; separate palettes would flicker."""
     from PIL import Image, ImageChops
     from PIL.GifImagePlugin import getdata, getheader
 
@@ -101,7 +101,7 @@ def _gif(pictures: Iterable[Picture], count: int, duration: int, out: IO[bytes])
         out.writelines(getheader(part.copy(), info={"loop": 0, "duration": duration, "optimize": False})[0])
         for frame in later:
             if (box := ImageChops.subtract_modulo(frame, before).getbbox()) is None:
-                lasts += duration  # nothing changed
+                lasts += duration  # nothing has changed
                 continue
             out.writelines(getdata(part, corner, duration=lasts, disposal=1))
             before, part, corner, lasts = frame, frame.crop(box), box[:2], duration
@@ -112,12 +112,12 @@ def _gif(pictures: Iterable[Picture], count: int, duration: int, out: IO[bytes])
 def _mp4(pictures: Iterable[Picture], rate: float) -> bytes:
     import imageio.v3 as imageio
 
-    def even() -> Iterator[Picture]:  # H.264 halves its colours: sides are even
+    def even() -> Iterator[Picture]:  # H.264 subsamples colour: sides must be even
         for picture in pictures:
             height, width = picture.shape[:2]
             yield np.pad(picture, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
 
-    each: Any = even()  # taken one by one, though the types of imageio say otherwise
+    each: Any = even()  # iterated once, contrary to the types of imageio
     return bytes(
         imageio.imwrite(
             "<bytes>", each, is_batch=True, extension=".mp4", plugin="FFMPEG", fps=rate, codec="libx264", quality=8,

@@ -1,4 +1,4 @@
-"""Films and coats in pictures: what is seen through a surface, and what its coat reflects.
+"""Films and coats in pictures: surfaces seen through others, and reflections of coats.
 
 A film shows its own light and, by its transmission, what lies behind; what lies behind is lit by its own grid. A coat
 is a rough clear layer (GGX, refractive index 1.5) over the matte surface: its reflected rays end in the light that
@@ -31,7 +31,7 @@ SMOOTHEST = 1e-4  # roughness of GGX below which a coat is a mirror to the eye
 
 
 def displayed(scene: Scene) -> Scene:
-    """The scene with the materials that pictures show: what is translucent has a transmission."""
+    """The scene with the materials of pictures: translucent fields get a transmission."""
 
     def shown(material: Material) -> Material:
         share = material.translucent
@@ -43,7 +43,7 @@ def displayed(scene: Scene) -> Scene:
 
 
 class Sight(NamedTuple):
-    """What `illumgrid.backends.sight` takes: a scene as pictures show it, with its light in RGB.
+    """The input of `illumgrid.backends.sight`: a scene as pictures show it, with its light in RGB.
 
     Parameters
     ----------
@@ -65,7 +65,7 @@ class Sight(NamedTuple):
 
 
 def sight_of(shown: "Shown") -> Sight:
-    """Lay out one setting of the sweep for sight."""
+    """Lay out one setting of the sweep for `illumgrid.backends.sight`."""
     from illumgrid.show.shade import CAP_TONE
 
     light, scene = shown.light, shown.displayed
@@ -74,7 +74,7 @@ def sight_of(shown: "Shown") -> Sight:
 
 
 def _lit(light: Illumination, scene: Scene) -> Marchable:
-    """The scene for marching, its lights at the weights of the light."""
+    """The scene for marching, with its lights at the weights of the light."""
     laid, channels = marchable(scene), light.grids[0].channels
     if not light.weights or channels.names != channels_of(light.scene).names:
         return laid
@@ -111,7 +111,7 @@ def _held(light: Illumination, share: float) -> Cache:
 
 
 class Layer(NamedTuple):
-    """What rays from the eye meet at one depth.
+    """The surfaces that rays from the eye meet at one depth.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Pictures: an isosurface lit by a lookup, a strip of several, and the illumination grid as a block."""
+"""Pictures: an isosurface lit by lookups, a strip of several, and the illumination grid as a block."""
 
 import io
 from collections.abc import Callable, Sequence
@@ -27,13 +27,13 @@ from illumgrid.tone import decode_srgb, encode_srgb
 
 Picture = NDArray[np.uint8]
 
-LARGEST = 16384  # pixels along a side, and in all those of a square half as wide
-STOPS = 20.0  # of exposure, either way
+LARGEST = 16384  # most pixels along a side; in total, those of a square of half that side
+STOPS = 20.0  # largest exposure in EV, up or down
 
 
 @dataclass(frozen=True, eq=False)
 class _Sheet:
-    """What a picture is drawn upon, and by which engine."""
+    """Size, background and engine of a picture."""
 
     width: int
     height: int
@@ -50,12 +50,12 @@ class _Sheet:
 
     @property
     def ground(self) -> NDArray[np.uint8]:
-        """Colour (3,) below captions, sRGB."""
+        """Colour (3,) behind captions, sRGB."""
         color = self.background[:3] if self.background[3] else np.full(3, BACKGROUND)
         return encode_srgb(color)
 
     def finished(self, picture: Picture) -> Picture:
-        """A picture (height, width, 4) without its coverage where everything is covered."""
+        """A picture (height, width, 4), without its coverage if everything is covered."""
         return picture[..., :3] if self.background[3] else picture
 
 
@@ -95,45 +95,45 @@ def render(
     width, height : int
         Pixels.
     local : bool
-        A lamp at the camera in place of the stored light, for comparison.
+        Use a lamp at the camera instead of the stored light, for comparison.
     trust : bool
-        In place of light its relative error bar, with a scale below; holes are hatched, walls and caps, which have no
-        bar, are grey.
+        Show relative error bars instead of light, with a scale below; holes are hatched, and walls and caps, which have
+        no bar, are grey.
     stops : float
         Exposure in EV beyond the automatic one, `Illumination.exposure`: each doubles the light.
     view : str or (azimuth, elevation), optional
         A name of `VIEWS`, or degrees to the right of the front and upwards.
     zoom : float
-        Enlarges the middle of the picture.
+        Magnification about the middle of the picture.
     up : str, optional
         World direction that is up: a name of `UPS`.
     roll : float
-        Degrees by which the picture is turned clockwise.
+        Degrees by which the picture is rotated clockwise.
     background : str, optional
-        Colour around the object, as CSS writes it: ``"white"``, ``"#202030"``, ``"transparent"``. By default a dark
+        CSS colour around the object: ``"white"``, ``"#202030"``, ``"transparent"``. By default a dark
         grey.
     bar : bool
-        A scale bar, which holds at the depth of the middle of the object.
+        Draw a scale bar, valid at the depth of the middle of the object.
     engine : {"software", "auto", "egl", "osmesa"}
-        What draws: see `choose_engine`.
+        Rendering engine: see `choose_engine`.
     camera : Camera, optional
-        In place of `view`, `zoom`, `up` and `roll`.
+        Replaces `view`, `zoom`, `up` and `roll`.
     exact : Exact, optional
         Gather light by rays from every pixel, drawn in software: see `illumgrid.show.exact`. Not with `local`, `trust`.
     watch : callable, optional
-        Called with each exact picture on the way, of four times as many rays as the one before, and with the last.
+        Called with each intermediate exact picture, of four times as many rays as the one before, and with the last.
     progress : callable, optional
         Called with (what, done, total) while light is gathered.
     clip : sequence of str
-        Planes beyond which nothing is drawn but walls: see `illumgrid.show.cuts.clips_of`. Cuts show the data in grey;
-        the light is that of the whole solid.
+        Planes beyond which only walls are drawn: see `illumgrid.show.cuts.clips_of`. Cuts show the data in grey; the
+        light is that of the whole solid.
     tint : Tint, optional
-        Colours of a second quantity in place of the fields' own, with a legend.
+        Colours of a second quantity instead of the fields' own, with a legend.
 
     Raises
     ------
     BadInput
-        On what cannot be understood, or an engine that is not available.
+        On invalid arguments, or an engine that is not available.
     """
     sheet = _sheet(width, height, background, engine)
     if not -STOPS <= stops <= STOPS:
@@ -227,8 +227,8 @@ def grid_volume(
 ) -> Picture:
     """Picture, sRGB, of the illumination grid of a field as a block (Figure 6 of the paper).
 
-    Each point of it has the colour that the level set through that point shows there, at the exposure of all pictures.
-    Parameters are those of `render`; `cut` leaves out the octant towards the eye, so that one looks inside.
+    Each point has the colour that the level set through that point has there, at the exposure of all pictures.
+    Parameters are those of `render`; `cut` leaves out the octant towards the eye, which shows the inside.
     """
     sheet = _sheet(width, height, background, engine)
     number = light.scene.number_of(field)
@@ -245,7 +245,7 @@ def _sheet(width: int, height: int, background: str | None, engine: str) -> _She
 
 
 def _background(color: str | None) -> Colors:
-    """Display-linear colour and coverage (4,) of a colour in the words of CSS."""
+    """Display-linear colour and coverage (4,) of a CSS colour."""
     if color is None:
         return opaque(np.full(3, BACKGROUND, dtype=np.float32))
     if color == "transparent":
@@ -261,7 +261,7 @@ def _background(color: str | None) -> Colors:
 
 
 def png(picture: ArrayLike, about: dict[str, str] | None = None) -> bytes:
-    """A picture (height, width, 3 or 4) as a PNG file; its text says which version wrote it, and what else is known.
+    """A picture (height, width, 3 or 4) as the bytes of a PNG file; its text states the version, and `about`.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Display-linear colours of what a picture shows: the same for every engine."""
+"""Display-linear colours of a picture's surfaces: the same for every engine."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -17,24 +17,24 @@ from illumgrid.show.tints import Tint
 from illumgrid.show.trust import trust_colors
 from illumgrid.tone import WHITE, curve, luminance
 
-BACKGROUND = 0.045  # display-linear: a dark neutral, against which white surfaces and their shadows both stand out
-CAP_TONE = 0.45  # display radiance of a cap of albedo 1 whose light is not known: a dark one would look like a hole
+BACKGROUND = 0.045  # display-linear: a dark neutral, against which white surfaces and their shadows are both visible
+CAP_TONE = 0.45  # display radiance of a cap of albedo 1 whose light is unknown: a dark one would look like a hole
 
 Colors = NDArray[np.float32]
 
 
 def opaque(color: Colors) -> Colors:
-    """Colours (..., 4) of full coverage."""
+    """Colours (..., 4) with full coverage."""
     return np.concatenate([color, np.ones((*color.shape[:-1], 1), np.float32)], axis=-1)
 
 
 class Coat(NamedTuple):
-    """What coats add.
+    """The contribution of coats.
 
     Parameters
     ----------
     radiance : (n, 3) float32
-        That they reflect to the eye.
+        Radiance that they reflect to the eye.
     matte : (n,) float64
         Share of the matte light that leaves through them.
     """
@@ -52,7 +52,7 @@ class Coat(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """One setting of the sweep, and how it is lit.
+    """One setting of the sweep, and its lighting.
 
     Parameters
     ----------
@@ -60,17 +60,17 @@ class Shown:
     row : (F,) float64
         Isovalue of every field.
     share : float
-        The place in the common sweep, 0 to 1, at which wall textures are read.
+        Position in the common sweep, 0 to 1, at which wall textures are read.
     local : bool
-        A lamp at the camera in place of the stored light, without shadows.
+        Use a lamp at the camera, without shadows, instead of the stored light.
     trust : bool
-        In place of light, its relative error bar: see `illumgrid.show.trust`.
+        Show the relative error bar instead of light: see `illumgrid.show.trust`.
     stops : float
         Exposure beyond the automatic one, in EV: each doubles the light.
     clips : tuple of Clip
-        What is left out.
+        Clip planes.
     tint : Tint, optional
-        Colours of all fields, in place of their albedos.
+        Colours of all fields, instead of their albedos.
     """
 
     light: Illumination
@@ -94,17 +94,17 @@ class Shown:
 
     @cached_property
     def sight(self) -> Sight:
-        """The scene laid out for films and coats."""
+        """The scene laid out for rays through films and coats."""
         return sight_of(self)
 
     @property
     def plain(self) -> bool:
-        """Whether triangles can show it: nothing is a film, has a coat or is cut."""
+        """Whether triangles can show it: no films, no coats, no cuts."""
         return self.matte and not self.clips
 
     @property
     def matte(self) -> bool:
-        """Whether nothing is a film or has a coat."""
+        """Whether it has neither films nor coats."""
         return all(field.material.plain for field in self.scene.fields)
 
     @cached_property
@@ -145,7 +145,7 @@ class Shown:
     def cap(self, number: int, points: Floats, face: NDArray[np.integer], facing: Floats) -> Colors:
         """Colours (n, 3) of caps of a field at world points (n, 3) on these faces (n,) of its box, -1 on inner sides.
 
-        A plain tone where their light is not known, and in pictures of its uncertainty.
+        A plain tone where their light is unknown, and in pictures of error bars.
         """
         if self.local and not self.trust:
             return self.field(number, points, facing)
@@ -160,7 +160,7 @@ class Shown:
     def wall(self, number: int, u: Floats, v: Floats, facing: Floats, light: Colors | None = None) -> Colors:
         """Colours (n, 3) of the front of a quad at shares u, v (n,) of its edges; `light` as for `field`."""
         material = self.scene.quads[number].material
-        if self.trust:  # walls have no error bar: no colour that could be taken for one
+        if self.trust:  # walls have no error bar: grey, which is no colour of the scale
             return _facing(np.full(3, 0.5 * CAP_TONE), facing)
         if self.local:
             return self._lamplit(np.maximum(material.albedo, material.emission.clip(0, 1)), facing)
@@ -169,7 +169,7 @@ class Shown:
         return curve((shown * self.exposure).astype(np.float32))
 
     def fade(self, number: int, u: Floats, v: Floats) -> Colors:
-        """Coverage (n,) of a quad at shares u, v (n,) of its edges: a ground under the open sky ends softly."""
+        """Coverage (n,) of a quad at shares u, v (n,) of its edges: a floor under the open sky fades out."""
         if not fades(self.scene, number):
             return np.ones(len(u), np.float32)
         rim = np.hypot(2 * u - 1, 2 * v - 1)  # a disc within the quad
@@ -181,7 +181,7 @@ class Shown:
 
 
 def fades(scene: Scene, number: int) -> bool:
-    """Whether a quad is the ground under an open sky, which pictures let end softly."""
+    """Whether a quad is the floor under an open sky, which pictures let fade out."""
     return scene.open and len(scene.quads) == 1 and not scene.quads[number].material.emission.any()
 
 

@@ -20,7 +20,7 @@ class Tint:
     Parameters
     ----------
     volume : Volume
-        In the same world; beyond its border its values go on.
+        In the same world coordinates; beyond its border, the border values continue.
     name : str
         For the legend.
     cmap : str

@@ -1,4 +1,4 @@
-"""What a picture shows, as coloured triangles for OpenGL."""
+"""The content of a picture as coloured triangles for OpenGL."""
 
 from dataclasses import dataclass
 
@@ -11,7 +11,7 @@ from illumgrid.field.volume import Floats, outward_normals, world_to_index
 from illumgrid.show.caps import face_normals
 from illumgrid.show.shade import Colors, Shown
 
-WALL_STEPS = 4  # squares along each side of a texel: what is bilinear between texels is then linear to the eye
+WALL_STEPS = 4  # squares along each side of a texel: between these, bilinear light looks linear
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +87,7 @@ def squares(nu: int, nv: int) -> NDArray[np.int64]:
 
 
 def wall(shown: Shown, number: int, eye: Floats) -> Colored:
-    """One quad, its triangles wound so that the front is theirs."""
+    """One quad, its triangles wound so that they face its front."""
     quad = shown.scene.quads[number]
     nu, nv = (WALL_STEPS * n + 1 for n in quad.texels)
     u, v = (x.ravel() for x in np.meshgrid(np.linspace(0, 1, nu), np.linspace(0, 1, nv), indexing="ij"))

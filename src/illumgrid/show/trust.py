@@ -1,4 +1,4 @@
-"""How far the light can be trusted: the relative error bar of each lookup, and the holes, as colours on the surface.
+"""Display of error bars: the relative error of each lookup, and the holes, as colours on the surface.
 
 The still picture and the page share one definition. The relative error of a lookup is its standard error over the mean
 light of the grid's supported nodes; a hole is a lookup that mixes at least one node without light of its own.
@@ -22,7 +22,7 @@ RESOLVED = 1.5  # `IlluminationGrid.resolution` below which bars are a lower bou
 SMALLEST = 240, 180  # pixels of a picture with a legible scale
 # Five colours of viridis (S. van der Walt and N. Smith, 2015), even steps, from certain to uncertain.
 SCALE = decode_srgb(np.array([(68, 1, 84), (59, 82, 139), (33, 145, 140), (94, 201, 98), (253, 231, 37)], np.uint8))
-HATCH = decode_srgb(np.array([(214, 48, 60), (128, 16, 30)], np.uint8))  # reds: the scale has none, nor have walls
+HATCH = decode_srgb(np.array([(214, 48, 60), (128, 16, 30)], np.uint8))  # reds: neither the scale nor walls have any
 _STRIPES = 60  # of a hole, along the longest axis of the grid
 _FLOOR = 0.4  # brightness of a surface that is seen edge-on, so that its shape shows
 
@@ -36,7 +36,7 @@ def scale_colors(bars: Floats) -> NDArray[np.float32]:
 
 
 def relative(grid: IlluminationGrid, error: NDArray[np.floating]) -> Floats:
-    """Standard errors over the mean light of the grid; as they are in the dark, infinite in holes."""
+    """Standard errors over the mean light of the grid; unchanged if that is 0, infinite in holes."""
     return np.asarray(error, dtype=float) / (grid.mean or 1.0)
 
 
@@ -54,7 +54,7 @@ def trust_colors(grid: IlluminationGrid, points: Floats, facing: Floats) -> NDAr
 
 
 def doubts(light: Illumination) -> list[str]:
-    """Where the error bars of a run are incomplete, and why; each the end of a sentence."""
+    """Where the error bars of a run are incomplete, and why; each text ends a sentence."""
     names, found = [field.name for field in light.scene.fields], []
     rough = [name for name, grid in zip(names, light.grids) if grid.resolution < RESOLVED]
     if rough:

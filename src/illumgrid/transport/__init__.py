@@ -1,1 +1,1 @@
-"""Queries and samples: what light transport is asked, and what it answers."""
+"""Queries and samples: the input and output of light transport, and the protocols of the stages."""

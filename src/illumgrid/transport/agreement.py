@@ -1,4 +1,4 @@
-"""A closed form against the answers of a backend, as z-scores."""
+"""Comparison of a backend's results with a closed form, as z-scores."""
 
 import time
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from illumgrid.transport.stages import Backend, capabilities
 Bools = NDArray[np.bool_]
 
 _HOLES = 0.01
-"""Share of the queries that may go unanswered: where noise turns a normal aside, it may not lead to the mesh."""
+"""Share of the queries that may stay unanswered: where noise tilts the normal, it may miss the mesh."""
 
 
 @dataclass(frozen=True)
@@ -55,21 +55,21 @@ def sidak(tests: int, level: float) -> float:
 def _score(off: Floats, bar: Floats, bound: Floats, noise: float) -> tuple[Floats, Floats]:
     """Score z of the mean over queries (3,), and of each query (n, 3), from differences and standard errors (n, 3)."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        # The bound is a bias: over many queries it does not average out.
+        # The bound is a bias: it does not average out over many queries.
         whole = off.mean(axis=0) / np.hypot(noise * np.sqrt((bar**2).sum(axis=0)) / len(off), bound.mean())
-        # A bar from few paths can be too short by luck: none is taken to be shorter than their root mean square.
+        # A bar from few paths can be too short by chance: none counts as shorter than their root mean square.
         longest = np.maximum(bar, np.sqrt((bar**2).mean(axis=0))) if noise else 0.0 * bar
         each = off / np.hypot(longest, bound[:, None])
     return np.where(off.mean(axis=0) == 0, 0.0, whole), np.where(off == 0, 0.0, each)
 
 
 def _measure(case: Case, backend: Backend, paths: int, seed: int) -> tuple[Floats, Floats, Bools, float]:
-    """What a backend finds for `expected`, its standard error, which queries were answered, and the error's noise.
+    """The result of a backend for `expected`, its standard error, which queries were answered, and the share of noise.
 
-    The last is the share of the standard error that is seen as noise: 0 if every path finds the same.
+    The last is the share of the standard error that is measured as noise: 0 if every path finds the same light.
     """
     # A power of two suits scrambled sequences.
-    least = 4 if case.area is None else 0  # the spread of a query's own paths is asked for
+    least = 4 if case.area is None else 0  # m2 needs the spread of a query's own paths
     count = 1 << max(least, int(np.log2(max(1, paths / len(case.queries)))))
     if case.area is None:
         one, other = (
@@ -97,7 +97,7 @@ def _measure(case: Case, backend: Backend, paths: int, seed: int) -> tuple[Float
 
 
 def applies(case: Case, backend: Backend) -> bool:
-    """Whether a case can be asked of a backend: on voxels only the trilinear level set itself passes."""
+    """Whether a case applies to a backend: queries on voxels need the trilinear level set itself."""
     return not case.voxels or capabilities(backend).surface == "levelset"
 
 

@@ -88,7 +88,7 @@ def on_quad(scene: Scene, number: int, level: float, shares: Floats, back: bool 
 
 
 def _pairs(cells: int, seed: int) -> Floats:
-    """Shares (2 cells², 2): two consecutive random points in each cell of a square divided into cells²."""
+    """Fractions (2 cells², 2): two consecutive random points in each cell of a square divided into cells²."""
     corner = np.repeat(np.argwhere(np.ones((cells, cells))), 2, axis=0)
     return np.asarray((corner + np.random.default_rng(seed).random(corner.shape)) / cells)
 

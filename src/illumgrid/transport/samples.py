@@ -75,7 +75,7 @@ class Queries:
         if not 0 <= field < len(scene.fields):
             raise BadInput(f"field {field} was requested; expected a number from 0 to {len(scene.fields) - 1}")
         own = scene.fields[field]
-        index = world_to_index(own.volume, np.where(np.isfinite(world), world, np.nan))  # infinite points are nowhere
+        index = world_to_index(own.volume, np.where(np.isfinite(world), world, np.nan))  # infinite points lie outside
         top = np.array(own.volume.shape) - 1
         good = np.asarray((np.isfinite(index) & (index >= 0) & (index <= top)).all(axis=1))
         index = np.where(good[:, None], index, 0.0)
@@ -134,10 +134,10 @@ class Samples:
         stored, channels = (self.mean, self.m2), self.channels
         if channels in (None, GREY) and all(array.shape[-1] == 3 for array in stored):
             channels = RGB
-            if not any(array.strides[-1] for array in stored):  # the RGB views of grey light
+            if not any(array.strides[-1] for array in stored):  # grey light as RGB
                 stored, channels = (self.mean[:, :1], self.m2[:, :1]), GREY
         widths = {array.shape[-1] for array in stored}
-        if channels is None or (widths == {3} and channels.own == 3):  # a new `mean` knows the light of all only
+        if channels is None or (widths == {3} and channels.own == 3):  # a new `mean` is that of all lights together
             channels = channels_for(self.mean.shape[-1])
         if widths != {len(channels)}:
             raise BadInput(

@@ -14,7 +14,7 @@ from illumgrid.transport.samples import Queries, Samples
 from illumgrid.transport.stages import Backend
 
 answered: ContextVar[Callable[[int], None]] = ContextVar("answered", default=lambda count: None)
-"""What a tracer calls while it solves, with the number of queries that have their answer since the last call."""
+"""Called by a tracer while it solves, with the number of queries that were answered since the last call."""
 
 
 class Tracer(Protocol):
@@ -26,7 +26,7 @@ class Tracer(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class _Unprepared:
-    """A backend that has `solve` and nothing to prepare."""
+    """A backend that has `solve` and no preparation."""
 
     backend: Backend
     scene: Scene
@@ -36,7 +36,7 @@ class _Unprepared:
 
 
 def prepare(backend: Backend, scene: Scene, cache: Cache = NO_CACHE) -> Tracer:
-    """Set up a scene for a backend; a backend without a method ``prepare`` is called by its ``solve``.
+    """Set up a scene for a backend; for a backend without a method ``prepare``, its ``solve`` is called.
 
     With a cache, paths end where it is trusted: see `ending_in`.
     """
@@ -46,12 +46,12 @@ def prepare(backend: Backend, scene: Scene, cache: Cache = NO_CACHE) -> Tracer:
 
 
 def ending_in(cache: Cache, tracer: Tracer) -> Tracer:
-    """The same tracer, whose paths end where a cache is trusted: every later bounce for the price of a lookup.
+    """The same tracer, whose paths end where a cache is trusted: all later bounces cost one lookup.
 
     A path that meets a surface before its last bounce ends there with albedo / π times the cached irradiance. It goes
     on from caps, from the backs of walls, after rays shorter than the lattice's spacing, in cells that are not trusted,
-    and if its levels are none of the sweep. Light that reaches the path without a surface is unchanged, and so are the
-    random numbers: what it gathers is a function of cache, seed, query, path.
+    and if its levels do not belong to one setting of the sweep. Light straight from sky and lamps is unchanged, and so
+    are the random numbers: the result is a function of cache, seed, query and path.
 
     Parameters
     ----------
@@ -64,14 +64,14 @@ def ending_in(cache: Cache, tracer: Tracer) -> Tracer:
     Raises
     ------
     BadInput
-        If the tracer is one of a plugin that knows no cache.
+        If the tracer is that of a plugin without support for a cache.
     """
     if not hasattr(tracer, "cache"):
         raise BadInput(
             f"{type(tracer).__name__} follows paths to their ends only; expected the backend numba, embree or reference"
         )
     light = cache.light.view()
-    light.flags.writeable = False  # always, also in another process: otherwise Numba compiles for another type
+    light.flags.writeable = False  # always, also in another process; otherwise Numba compiles for another type
     ending: Tracer = replace(cast(Any, tracer), cache=cache._replace(light=light))
     return ending
 

@@ -1,4 +1,4 @@
-"""A walk of paths from many targets in pieces: any size, any order, kept on the way, the same bits in the end."""
+"""Tracing paths from many targets, in pieces of any size and order, with answers kept; the result has the same bits."""
 
 import time
 from collections import deque
@@ -16,18 +16,18 @@ from illumgrid.transport.tracer import Tracer
 PIECE = 1 << 17
 """Paths in the first piece of work."""
 SECONDS = 2.0
-"""That a piece should take: later ones are sized by the pace of those before."""
+"""Seconds that a piece should take; later pieces are sized by the pace of those before."""
 AT_ONCE = 0.25
-"""The same where somebody looks on, and may look elsewhere before the next piece."""
+"""The same if somebody watches, and may look elsewhere before the next piece."""
 MOST = 1 << 16
-"""Targets of a piece, whose queries and answers are held beside those of the whole walk."""
+"""Largest number of targets of a piece, whose queries and answers are held in addition to those of the whole walk."""
 LOOKED_AT = 1 << 22
-"""Targets among which the next ones are looked for at a time."""
+"""Targets among which the next ones are searched at a time."""
 GROWTH = 4.0
-"""How many times larger, or smaller, the next piece may be."""
+"""Largest ratio of the sizes of consecutive pieces."""
 
 Ranks = Sequence[NDArray[np.integer]]
-"""For each batch numbers (n,) by which its targets are walked from, lowest first."""
+"""For each batch, ranks (n,): targets of low rank come first."""
 
 
 Chooser = Callable[[NDArray[np.bool_], Sequence[int]], tuple[int, NDArray[np.int64]]]
@@ -36,41 +36,41 @@ piece, and which of its targets, in their order."""
 
 
 class Keeper(Protocol):
-    """Keeps answers while a walk goes on, and gives back those of a walk that was stopped: `illumgrid.io.partial`.
+    """Keeps answers during a walk, and returns those of a walk that was stopped: see `illumgrid.io.partial`.
 
     A row is the place of a target in all batches, one after the other.
     """
 
     def begin(self, targets: Sequence[Queries], order: NDArray[np.int64]) -> Chooser | None:
-        """Learn what is asked, and the rows in the order in which their answers will come; or choose another order."""
+        """Receive the targets, and the rows in the order in which their answers will come; may choose another order."""
 
     def known(self, paths: range) -> "Answer | None":
-        """Answers of all rows, with paths -1 where none is known; None without any."""
+        """Answers of all rows, with paths -1 for unknown ones; None if none is known."""
 
     def keep(self, rows: NDArray[np.int64], answer: "Answer") -> None:
         """Take the answers of some rows."""
 
     def flush(self) -> None:
-        """Bring to the disk what was taken, if that is worth it."""
+        """Bring the received answers to the disk, if that is worthwhile."""
 
     def end(self, answers: Sequence[Samples]) -> None:
-        """Take the moments of all paths of all rows, in the end."""
+        """Receive the moments of all paths of all rows at the end."""
 
 
 class RunKeeper(Keeper, Protocol):
-    """A keeper that takes down what a whole run chose."""
+    """A keeper that also records what a whole run chose."""
 
     at_once: bool
-    """Whether the first answers are waited for: then no coarse grid is lit before, in which paths end."""
+    """Whether somebody waits for the first answers: then no coarse grid is lit first in which paths end."""
     chosen: dict[str, Any] | None
-    """By the run that is gone on with."""
+    """The choices of the run that is resumed."""
 
     def choose(self, chosen: dict[str, Any]) -> None:
-        """Take down what was chosen, which a run that goes on takes over."""
+        """Record the choices of a run, for a run that resumes it."""
 
 
 class Answer(NamedTuple):
-    """What a piece of work brings back: samples without their queries, which stay where they are."""
+    """The result of a piece of work: samples without their queries, which are not sent back."""
 
     light: NDArray[np.float32]
     spread: NDArray[np.float32]
@@ -88,7 +88,7 @@ def answer(tracer: Tracer, bounces: int, seed: int, work: tuple[Queries, range])
 
 @dataclass(eq=False)
 class Walk:
-    """A walk that is going on: pieces of its work, and the answers of each batch as they come in.
+    """A walk in progress: the pieces of its work, and the answers of each batch as they come in.
 
     An answer does not depend on what is asked together with it, so a piece may have any size.
 
@@ -112,7 +112,7 @@ class Walk:
     asked: deque[tuple[int, NDArray[np.int64]]] = field(default_factory=deque)
 
     def pieces(self, ranks: Ranks | None = None) -> Iterator[tuple[Queries, range]]:
-        """What is not known yet, as it is asked for: targets of a low rank in all batches first."""
+        """Yield unknown targets in pieces: those of a low rank in all batches first."""
         ranks = ranks or [np.zeros(len(q), np.int8) for q in self.targets]
         for now in sorted({int(r) for each in ranks for r in np.unique(each)}):
             for number, (queries, paths, known) in enumerate(zip(self.targets, self.ranges, self.answers)):
@@ -123,14 +123,14 @@ class Walk:
                         yield queries[slice(None) if len(some) == len(queries) else some], paths
 
     def wanted(self, choose: Chooser) -> Iterator[tuple[Queries, range]]:
-        """What is not known yet, each piece as it is chosen, once the one before is answered."""
+        """Yield unknown targets; each piece is chosen when the one before is answered."""
         while (unknown := self._unknown()).any():
             number, rows = choose(unknown, [self._most(paths) for paths in self.ranges])
             self.asked.append((number, rows))
             yield self.targets[number][rows], self.ranges[number]
 
     def _most(self, paths: range) -> int:
-        """Targets of the next piece."""
+        """Number of targets of the next piece."""
         return min(max(1, int(self.size / max(len(paths), 1))), MOST)
 
     def _unknown(self) -> NDArray[np.bool_]:
@@ -138,7 +138,7 @@ class Walk:
         return np.concatenate([np.zeros(0, bool), *each])
 
     def take(self, found: Answer) -> tuple[int, NDArray[np.int64]]:
-        """Put the answer to the piece that has waited longest in its place; returns the batch and the rows in it."""
+        """Store the answer to the oldest outstanding piece; returns the batch and the rows in it."""
         number, rows = self.asked.popleft()
         pace = len(rows) * len(self.ranges[number]) / max(found.seconds, 1e-3)
         self.size = min(max(pace * self.seconds, self.size / GROWTH, 1.0), GROWTH * self.size)
@@ -157,7 +157,7 @@ class Walk:
 
 
 def _due(ranks: NDArray[np.integer], now: int, known: Samples | None) -> Iterator[NDArray[np.int64]]:
-    """Rows of one rank that are not known, some after the other: their numbers take more than what is known of them."""
+    """Unknown rows of one rank, in portions: their numbers need more memory than the marks of known rows."""
     for first in range(0, len(ranks), LOOKED_AT):
         some = slice(first, first + LOOKED_AT)
         due = ranks[some] == now

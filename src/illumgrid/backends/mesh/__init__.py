@@ -1,1 +1,1 @@
-"""Level sets as meshes: built and kept, a tree over them, and rays that are cast at them."""
+"""Level sets as meshes: built and kept, with a tree over them, and rays against them."""

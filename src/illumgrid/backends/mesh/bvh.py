@@ -26,7 +26,7 @@ class Tree(NamedTuple):
     """
 
     memory: NDArray[np.float32]  # nodes, the root first, then leaves
-    centre: NDArray[np.float64]  # (3,) what becomes the origin
+    centre: NDArray[np.float64]  # (3,) the point that becomes the origin
     scale: float  # a power of two
     depth: int  # nodes from the root to the deepest one
 
@@ -40,7 +40,7 @@ def half_area(box):
 
 @jit
 def enclose(box, other):
-    """Grow a box until it holds the other one."""
+    """Grow a box until it contains the other one."""
     for a in range(3):
         box[a] = min(box[a], other[a])
         box[3 + a] = max(box[3 + a], other[3 + a])
@@ -192,7 +192,7 @@ def fill(memory, links, triangles, order, child, span, box, wide):
             elif n >= 0:
                 links[base + LINKS + k] = -leaf
                 for m in range(WIDE):
-                    # What is empty becomes a point, which no ray meets.
+                    # An empty box becomes a point, which no ray meets.
                     live = span[n, 0] + m < span[n, 1]
                     number = order[span[n, 0] + (m if live else 0)]
                     for j in range(3):
@@ -211,7 +211,7 @@ def aligned(elements: int, dtype: Any) -> NDArray[Any]:
 
 
 def unit_cube(corners: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
-    """What moves and scales the corners (m, 3, 3) of triangles into [-1, 1]³: centre (3,) and a power of two."""
+    """Centre (3,) and power of two that move and scale the corners (m, 3, 3) of triangles into [-1, 1]³."""
     if len(corners) == 0:
         return np.zeros(3), 1.0
     low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
@@ -248,7 +248,7 @@ def build(vertices: ArrayLike, faces: ArrayLike) -> Tree:
         child, span, box = grow(bounds, order, halt)
         return child, span, box, *collapse(child, box, halt)
 
-    with ThreadPoolExecutor(1) as other:  # this one waits for Ctrl-C
+    with ThreadPoolExecutor(1) as other:  # this thread waits for Ctrl-C
         try:
             child, span, box, wide, depth = other.submit(work).result()
         except BaseException:
@@ -261,5 +261,5 @@ def build(vertices: ArrayLike, faces: ArrayLike) -> Tree:
 
 
 def stack_for(*trees: Tree) -> NDArray[np.int32]:
-    """Room for the traversal of any of these trees: one for each thread, however many rays."""
+    """Scratch memory for the traversal of any of these trees: one for each thread, for any number of rays."""
     return aligned((max((tree.depth for tree in trees), default=0) + 1) * FRAME, np.int32)

@@ -1,4 +1,4 @@
-"""Rays that are cast at the meshes of level sets, which differ from the trilinear sets by O(spacing²)."""
+"""Rays against the meshes of level sets, which differ from the trilinear sets by O(spacing²)."""
 
 import numpy as np
 
@@ -34,8 +34,8 @@ def cast_from(scene, f, x, d, limit):
 def mesh_from(scene, f, level, x, n, d, own, face, limit):
     """First meeting of the frame ray x + t d with field f's mesh, t < limit: (t, what, face).
 
-    It starts on a surface of normal n, and if `own` on this mesh, on `face`. If it goes under that face it has met it
-    at once; else it starts off by what rounding may do. If it meets a back after that, it went under a neighbour.
+    It starts on a surface of normal n; if `own`, on this mesh, on `face`. If it dips under that face, it meets it at
+    once; otherwise it is offset by the bound on rounding. If it then meets a back face, it dipped under a neighbour.
     """
     off = scene.off[f]
     if own:
@@ -65,7 +65,7 @@ def normal_on_mesh(scene, f, what, face, x, d):
 
 @jit
 def in_mesh(scene, f, level, x, n):
-    """Whether the frame point x lies inside the mesh of field f, or on it: a ray from beside x along n sees a back."""
+    """Whether the frame point x lies in or on the mesh of field f: a ray from beside x along n meets a back face."""
     off = scene.off[f]
     x = (x[0] + off * n[0], x[1] + off * n[1], x[2] + off * n[2])
     _, face, front = cast_from(scene, f, x, n, np.inf)
@@ -80,7 +80,7 @@ def settle_along(scene, own, x, n):
     """
     pace = max(
         abs(n[0]) / scene.spacing[own, 0], abs(n[1]) / scene.spacing[own, 1], abs(n[2]) / scene.spacing[own, 2]
-    )  # cells along the axis on which it gains most
+    )  # cells along the axis on which it advances most
     found, shift, face, near = np.inf, 0.0, LOST, 2.0 * scene.off[own]
     for k in range(2):
         along = 2.0 * k - 1.0
@@ -96,7 +96,7 @@ def settle_along(scene, own, x, n):
 def settle(scene, own, x, n):
     """Move a query onto its own mesh, which lies a little beside the trilinear set: (position, face).
 
-    Along its normal, or where noise turns that aside, along the normal of its cell; LOST if neither leads there.
+    Along its normal, or, where noise tilts that, along the normal of its cell; LOST if neither reaches the mesh.
     """
     if own >= scene.twin.shape[0]:
         return x, NOWHERE

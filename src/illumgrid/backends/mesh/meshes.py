@@ -1,4 +1,4 @@
-"""Level sets as closed meshes that rays meet: grouped by level, built once, kept while there is room.
+"""Level sets as closed meshes for rays: grouped by level, built once, kept as long as memory allows.
 
 A mesh lies in the axes of its volume, from voxel 0, in world units.
 """
@@ -19,24 +19,24 @@ from illumgrid.field.scene import Field, Scene
 from illumgrid.field.volume import Floats
 
 SAME_LEVEL = 1e-6
-"""Levels that this share of a field's range rounds to the same number share a mesh."""
+"""Levels that are equal when rounded to this share of a field's range have a common mesh."""
 
 MOST_ROWS = 256
-"""Rows of levels that one request may have: at 128³ voxels each costs about half a second to extract and to build."""
+"""Most rows of levels of one call: at 128³ voxels each takes about half a second to extract and build."""
 
 ROOM = 1 << 28
-"""Bytes of meshes that a tracer keeps; the one used longest ago goes first."""
+"""Bytes of meshes that a tracer keeps; the one not used for the longest time goes first."""
 
 TREE = 160
-"""Bytes of a tree for each face of its mesh, about."""
+"""Approximate bytes of a tree for each face of its mesh."""
 
 OFF = 2.0**-19
-"""How far rays start off a face, as a share of the half extent of its mesh: what rounding to single precision may move
-a triangle, an origin and a hit, four times over."""
+"""Offset of rays that start on a face, as a share of the half extent of its mesh: four times the bound on the error of
+triangle, origin and hit by rounding to single precision."""
 
 
 def check_opaque(scene: Scene) -> None:
-    """Refuse fields that transmit: the inner sides of meshes are met by accident only.
+    """Refuse fields that transmit: rays would hardly meet the inner sides of meshes.
 
     Raises
     ------
@@ -45,7 +45,7 @@ def check_opaque(scene: Scene) -> None:
     for film in scene.fields:
         if film.material.transmission > 0:
             raise BadInput(
-                f"field {film.name!r} has a transmission, which meshes do not know; expected the backend numba with "
+                f"field {film.name!r} has a transmission, which meshes do not support; expected the backend numba with "
                 "the surface levelset, or reference"
             )
 
@@ -101,9 +101,9 @@ def level_mesh(field: Field, level: float, grow: Callable[[Floats, NDArray[np.in
 
 @dataclass(frozen=True, eq=False)
 class Meshes:
-    """Level sets of a scene as meshes: each is built when it is first asked for, and kept while there is room.
+    """The meshes of a scene's level sets: each is built on first use, and kept as long as memory allows.
 
-    Any thread may ask: one builds, the others wait.
+    Any thread may call: one builds, the others wait.
 
     Parameters
     ----------
@@ -118,7 +118,7 @@ class Meshes:
     _lock: Any = field(default_factory=Lock)
 
     def of(self, row: Floats) -> list[LevelMesh]:
-        """Those of every field under a row of levels (F,)."""
+        """The meshes of every field under a row of levels (F,)."""
         with self._lock:
             found = []
             for key in enumerate(row.tolist()):
@@ -131,10 +131,10 @@ class Meshes:
 
 
 def row_groups(scene: Scene, level: Floats) -> Iterator[tuple[Floats, NDArray[np.int64]]]:
-    """Rows of levels (F,) that differ, and the queries (n,) that ask for each.
+    """Distinct rows of levels (F,), and the queries (n,) on each.
 
-    Levels are rounded to a millionth of the field's range, whatever else is in the batch: an answer depends on the
-    query alone.
+    Levels are rounded to a millionth of the field's range, independently of the batch: a result depends on the query
+    alone.
 
     Raises
     ------
@@ -160,15 +160,15 @@ Meshed = namedtuple(  # type: ignore[misc]
     "Meshed",
     (
         *Marchable._fields,
-        "centre",  # (F, 3) frame position that is the origin of the space of the field's mesh
-        "scale",  # (F,) into that space
+        "centre",  # (F, 3) frame position of the origin of the space of the field's mesh
+        "scale",  # (F,) scale into that space
         "facing",  # (m, 3) unit normals of the faces of all fields, in the frame
         "cap",  # (m,) bool
         "face_start",  # (F,) int64: number of the first face of each
-        "off",  # (F,) how far rays start off a face
+        "off",  # (F,) offset of rays that start on a face
         "memory",  # (...) float32: the trees of all fields, one after the other, if these are `bvh.Tree`
         "tree_start",  # (F,) int64: where each begins
-        "stack",  # (...) int32: room for the traversal, one for each thread
+        "stack",  # (...) int32: scratch memory for the traversal, one for each thread
     ),
 )
 """A `Marchable` with the meshes of one row of levels: what compiled kernels cast rays at."""

@@ -1,4 +1,4 @@
-"""Rays against a tree of triangles: one ray goes down at a time and meets eight boxes or triangles at once (`simd`)."""
+"""Rays against a tree of triangles: one ray at a time descends, and meets eight boxes or triangles at once (`simd`)."""
 
 from typing import Any, NamedTuple
 
@@ -33,11 +33,11 @@ from illumgrid.backends.simd import (
 jit = cached(simd, bvh)  # no fastmath: the signs of products must be exact
 inlined = numba.njit(nogil=True, error_model="numpy", inline="always")
 
-# Everything happens within |x| <= 2, where coordinates are wrong by 2^-24 and what is made of them by less than
-# 2^-20: boxes grown by this hold every triangle that the test below reports, wherever it reports it.
+# All coordinates are within |x| <= 2, where they are wrong by 2^-24 and results by less than
+# 2^-20: boxes enlarged by this contain every triangle that the test below reports, wherever it reports it.
 PAD = np.float32(2.0**-18)
-FLAT = 1e-36  # twice the area, seen along the ray, below which a triangle is an edge
-ROOM = 2.0  # a ray that begins farther out is moved near first, in double precision
+FLAT = 1e-36  # twice the area, seen along the ray, below which a triangle counts as an edge
+ROOM = 2.0  # a ray that begins farther out is first moved near, in double precision
 NONE = 0x7FFFFFFF
 
 
@@ -53,7 +53,7 @@ class View(NamedTuple):
 
 @jit
 def view(tree):
-    """View of a tree: taken once a chunk of rays."""
+    """View of a tree: made once per chunk of rays."""
     return View(address(tree.memory), tree.centre[0], tree.centre[1], tree.centre[2], tree.scale)
 
 
@@ -76,7 +76,7 @@ def slab(o, d, tiny):
 
     The pad is inside n and f: Ize, "Robust BVH ray traversal", JCGT 2(2), 2013.
     """
-    # A direction of 0 becomes one so small that it moves nothing, and has an inverse.
+    # A direction of 0 becomes so small that it moves nothing, but has an inverse.
     i = np.float32(1.0) / np.float32(choose(abs(d) < tiny, tiny, d))
     pad = PAD * abs(i)
     return spread(i), spread(-o * i - pad), spread(-o * i + pad), choose(i < 0.0, WIDE, 0)
@@ -95,7 +95,7 @@ def boxes(memory, node, x, y, z, reach):
 
 @inlined
 def shear(ox, oy, oz, dx, dy, dz):
-    """What makes the ray an axis, for `meet`: the axes turned so that it goes farthest along the last."""
+    """Make the ray an axis, for `meet`: the axes are permuted so that it goes farthest along the last."""
     ax, ay, az = abs(dx), abs(dy), abs(dz)
     first = (ax >= ay) & (ax >= az)
     second = (ay >= az) & (not first)
@@ -114,7 +114,7 @@ def meet(memory, leaf, ray, reach):
     """Eight triangles against a ray: (mask of hits, t, weight of the second corner, of the third).
 
     The space is sheared so that the ray becomes an axis. A shared edge then gives two triangles the same products with
-    opposite sign, and rounding cannot turn a sign, only make it 0, which counts as inside: no ray gets between.
+    opposite sign, and rounding cannot change a sign, only make it 0, which counts as inside: no ray passes between.
     Woop, Benthin & Wald, "Watertight ray/triangle intersection", JCGT 2(1), 2013, without a second precision.
     """
     kx, ky, kz, px, py, pz, hx, hy, pace = ray
@@ -128,7 +128,7 @@ def meet(memory, leaf, ray, reach):
     front = (minimum(minimum(w0, w1), w2) >= zero) & (area > flat)
     back = (maximum(maximum(w0, w1), w2) <= zero) & (area < zero - flat)
     over = one / choose(front | back, area, one)
-    # No branch before here: whether a ray meets one of eight triangles is a coin toss that no processor predicts.
+    # No branch before here: no processor can predict whether a ray meets one of eight triangles.
     t = ((w0 * z0 + w1 * z1) + w2 * z2) * over * pace
     return mask((front | back) & (t > zero) & (t <= reach)), t, w1 * over, w2 * over
 
@@ -137,11 +137,11 @@ def meet(memory, leaf, ray, reach):
 def cast(tree, stack, x, y, z, dx, dy, dz, limit, any_hit):
     """First triangle that a ray x + t d, 0 < t < limit, meets: (t, number, u, v); t inf and number -1 if none.
 
-    `tree` is a View, `stack` the address of what `stack_for` gave. With any_hit it is any triangle. The hit lies at
-    (1 - u - v) a + u b + v c. Where triangles are hit at the same t, the lowest number counts: the order in which the
-    tree is visited never shows. d need not have unit length, but not length 0.
+    `tree` is a View, `stack` the address of an array from `stack_for`. With any_hit it is any triangle. The hit lies at
+    (1 - u - v) a + u b + v c. If triangles are hit at the same t, the lowest number counts, so that the result does not
+    depend on the order in which the tree is visited. d may have any length but 0.
     """
-    # In the space of the tree; t stays what it was.
+    # In the space of the tree; t is unchanged.
     x, y, z = (x - tree.x) * tree.scale, (y - tree.y) * tree.scale, (z - tree.z) * tree.scale
     dx, dy, dz = dx * tree.scale, dy * tree.scale, dz * tree.scale
     start = 0.0
@@ -165,7 +165,7 @@ def cast(tree, stack, x, y, z, dx, dy, dz, limit, any_hit):
             these = mask(met)
             if these != 0:
                 links = link + LINKS
-                if these & (these - 1) == 0:  # most often only one is met: needs no order, none has to wait
+                if these & (these - 1) == 0:  # most often only one box is met: no sorting, nothing has to wait
                     link = peek(memory, links + lowest(these))
                     continue
                 # Distance and lane in one integer: the smallest is the next, and the rest may wait.
@@ -187,7 +187,7 @@ def cast(tree, stack, x, y, z, dx, dy, dz, limit, any_hit):
                     reach = spread(best)
             if any_hit and face >= 0:
                 break
-        # Back to the nearest box that waits, on the lowest level that has one within reach.
+        # Back to the nearest waiting box, on the lowest level that has one within reach.
         key = NONE
         while level > 0:
             keys = load_int(stack, level - FRAME)

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 LATTICES = {".vti": vti.write, ".nrrd": arrays.write_nrrd, ".exr": arrays.write_exr, ".npz": arrays.write_npz}
 FIELDS = {ending: LATTICES[ending] for ending in (".nrrd", ".vti", ".npz")}
-"""Those that `read_volume` reads back with all digits."""
+"""Formats that `read_volume` reads back with all digits."""
 SURFACES = {".glb": surface.write_glb, ".ply": surface.write_ply}
 
 
@@ -137,7 +137,7 @@ def write(
 
 
 def check_field(path: str | os.PathLike[str]) -> None:
-    """Refuse a name whose ending is none of a field's file."""
+    """Refuse a name that does not end like a file of a field."""
     if Path(path).suffix.lower() not in FIELDS:
         raise BadInput(f"the file to write is {Path(path).name!r}; expected a name that ends in {', '.join(FIELDS)}")
 
@@ -148,7 +148,7 @@ def write_field(
     name: str,
     progress: "Progress" = lambda what, done, total: None,
 ) -> None:
-    """Write a field without light to a `.nrrd`, `.vti` or `.npz`, as the array "field"; whole, or not at all."""
+    """Write a field without light to a `.nrrd`, `.vti` or `.npz`, as the array "field"; completely or not at all."""
     check_field(path)
     points = arrays.field_alone(volume, name)
     with disk.fresh_file(path) as fresh:

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from illumgrid.light import Illumination
 
 NAMES = ("irradiance", "error", "support", "field", "color")
-"""What each point carries, in the order of the files."""
+"""Arrays of every file, in order."""
 
 _AT_ONCE = 1 << 18
 """Points that are looked up together: bounds the memory."""
@@ -39,7 +39,7 @@ Arrays = dict[str, NDArray[Any]]
 
 @dataclass(frozen=True, eq=False)
 class Points:
-    """Arrays on a lattice, all of one field: computed a part at a time, as a file takes them.
+    """Arrays on a lattice, all of one field, computed in parts as a file takes them.
 
     Parameters
     ----------
@@ -52,9 +52,9 @@ class Points:
     at : callable
         Takes names and whole indices (m, 3); returns arrays (m,) or, of irradiance and color, (m, 3).
     albedo : (3,) float64, optional
-        Of the field's material; None where there is no light.
+        Of the field's material; None without light.
     exposure : float, optional
-        What `color` was exposed by: sRGB of the tone curve of albedo/π · irradiance · exposure.
+        Exposure of `color`: sRGB of the tone curve of albedo/π · irradiance · exposure.
     """
 
     field: str
@@ -69,7 +69,7 @@ class Points:
         return 3 if name in ("irradiance", "color") else 1
 
     def parts(self, names: Sequence[str], x_fastest: bool, progress: "Progress") -> Iterator[Arrays]:
-        """Yield consecutive points, with x running fastest, as image formats want it, or z, as NumPy does."""
+        """Yield consecutive points, with x running fastest, as in image formats, or z, as in NumPy."""
         shape = self.lattice.shape[::-1] if x_fastest else self.lattice.shape
         count = int(np.prod(shape))
         for first in range(0, count, _AT_ONCE):
@@ -81,7 +81,7 @@ class Points:
 
 
 def display_linear(light: "Illumination", number: int, irradiance: NDArray[np.float32]) -> NDArray[np.float32]:
-    """What a screen shows of irradiance (n, 3), before sRGB: the tone curve of albedo/π · E · exposure."""
+    """Display-linear colour of irradiance (n, 3), before sRGB: the tone curve of albedo/π · E · exposure."""
     factor = light.scene.fields[number].material.albedo / np.pi * light.exposure
     return np.asarray(curve(irradiance * factor), dtype=np.float32)
 
@@ -108,7 +108,7 @@ def field_alone(volume: Volume, name: str) -> Points:
 
 
 def _kind(volume: Volume) -> np.dtype[Any]:
-    """Where the field has an offset or scale that single precision does not hold, nor does the file."""
+    """Type of the field in a file: double precision if its offset or scale exceeds single precision."""
     return np.dtype(np.float32 if volume.plain or single_precision_holds(*volume.extremes) else np.float64)
 
 
@@ -170,7 +170,7 @@ def write_exr(path: Path, points: Points, progress: "Progress") -> None:
         "layout": LAYOUT.format(nx, ny, nz), "origin": points.lattice.origin, "spacing": points.lattice.spacing,
         "direction": points.lattice.direction, "exposure": points.exposure,
     }  # fmt: skip
-    shown = [name for name in points.kinds if name != "color"]  # an EXR viewer makes its own
+    shown = [name for name in points.kinds if name != "color"]  # an EXR viewer applies its own tone curve
     channels = {c: np.float32 for name in shown for c in ("RGB" if name == "irradiance" else [name])}
     rows = _whole_rows(points.parts(shown, True, progress), nx)
     scanlines.write(path, [scanlines.Part((nx, nz * ny), channels, rows, about)])
@@ -178,7 +178,7 @@ def write_exr(path: Path, points: Points, progress: "Progress") -> None:
 
 
 def _whole_rows(parts: Iterator[Arrays], width: int) -> Iterator[list[NDArray[Any]]]:
-    """Each component of arrays that come in parts as rows (m, width)."""
+    """Each component of arrays that come in parts, as rows (m, width)."""
     rest: list[NDArray[Any]] = []
     for part in parts:
         columns = [c for array in part.values() for c in (array.T if array.ndim == 2 else [array])]
@@ -189,7 +189,7 @@ def _whole_rows(parts: Iterator[Arrays], width: int) -> Iterator[list[NDArray[An
 
 
 def write_npz(path: Path, points: Points, progress: "Progress") -> None:
-    """Write the arrays, indexed [x, y, z], and where they lie; one after the other, as a ZIP takes them."""
+    """Write the arrays, indexed [x, y, z], and their placement, one after the other, as a ZIP needs them."""
     lattice = points.lattice
     place: dict[str, Any] = {name: getattr(lattice, name) for name in ("origin", "spacing", "direction")}
     if points.albedo is not None and points.exposure is not None:

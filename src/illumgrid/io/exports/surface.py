@@ -38,9 +38,9 @@ class LitSurface:
     linear : (n, 3) float32
         albedo/π · irradiance · exposure at the vertices, clamped to 0 .. 1, or the mesh's own colours.
     colors : str
-        What `linear` is.
+        Description of `linear`.
     shade : (n,) float32, optional
-        Brightness of a white surface, for a mesh that came from elsewhere: see `Illumination.shade`.
+        Brightness of a white surface, for a given mesh: see `Illumination.shade`.
     """
 
     field: str
@@ -52,7 +52,7 @@ class LitSurface:
     shade: NDArray[np.float32] | None = None
 
     def about(self) -> dict[str, Any]:
-        """What a reader of the file should know."""
+        """Information for a reader of the file."""
         about: dict[str, Any] = {"field": self.field}
         if self.isovalue is not None:
             about["isovalue"] = self.isovalue
@@ -60,7 +60,7 @@ class LitSurface:
 
 
 def lit(light: "Illumination", number: int, isovalue: float | None, progress: "Progress") -> LitSurface:
-    """Extract an isosurface of field `number`, by default that in the middle of its range, and look its light up."""
+    """Extract an isosurface of field `number`, by default that in the middle of its range, and look up its light."""
     field = light.scene.fields[number]
     ends = (low, high) = tuple(float(x) for x in field.range)
     level = 0.5 * (low + high) if isovalue is None else float(isovalue)
@@ -89,7 +89,7 @@ def lit(light: "Illumination", number: int, isovalue: float | None, progress: "P
 def lit_onto(
     light: "Illumination", number: int, isovalue: float | None, mesh: "trimesh.Trimesh", linear: bool
 ) -> LitSurface:
-    """Light for a mesh that came from elsewhere; colours of its own are kept, and they are `linear` or sRGB."""
+    """Light for a given mesh; its own colours are kept, and are `linear` or sRGB."""
     field = light.scene.fields[number]
     points = onto_levels(field, mesh.vertices, isovalue)
     shade = light.shade(points, field.name)
@@ -103,7 +103,7 @@ def lit_onto(
 
 
 def write_glb(path: Path, surface: LitSurface) -> None:
-    """Write binary glTF 2.0: linear float colours, unlit, y up; the mesh's extras say what the colours are.
+    """Write binary glTF 2.0: linear float colours, unlit, y up; the mesh's extras describe the colours.
 
     trimesh writes vertex colours as bytes, in which dark linear light shows bands; a float attribute avoids that.
     Positions are single precision, relative to the mesh's centre; a node of the file places and turns them.
@@ -125,7 +125,7 @@ def write_glb(path: Path, surface: LitSurface) -> None:
 
 
 def _unlit(tree: dict[str, Any]) -> None:
-    """Make the attribute the colour, and the material one that no lamp of a viewer lights."""
+    """Use the attribute as colour, with a material that no lamp of a viewer lights."""
     tree["asset"]["generator"] = f"illumgrid {version('illumgrid')} with {tree['asset']['generator']}"
     tree["extensionsUsed"] = ["KHR_materials_unlit"]
     base = {"baseColorFactor": [1, 1, 1, 1], "metallicFactor": 0, "roughnessFactor": 1}  # for viewers without unlit
@@ -139,7 +139,7 @@ def _unlit(tree: dict[str, Any]) -> None:
 
 
 def write_ply(path: Path, surface: LitSurface) -> None:
-    """Write binary PLY: world coordinates, sRGB bytes, and comments that say what the colours are."""
+    """Write binary PLY: world coordinates, sRGB bytes, and comments that describe the colours."""
     import trimesh
 
     mesh = trimesh.Trimesh(surface.mesh.vertices, surface.mesh.faces, process=False)

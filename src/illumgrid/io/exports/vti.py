@@ -1,4 +1,4 @@
-"""VTK image data, ``.vti``: what ParaView, PyVista and VTK read.
+"""VTK image data, ``.vti``, for ParaView, PyVista and VTK.
 
 The file is made here, in sixty lines of XML and zlib: VTK itself would be a dependency of half a gigabyte, meshio
 does not write image data, and pyevtk knows neither compression nor the direction of the axes.
@@ -24,13 +24,13 @@ if TYPE_CHECKING:
     from illumgrid.bake.accumulator import Progress
 
 _BLOCK = 1 << 18
-"""Bytes that are packed together."""
+"""Bytes that are compressed together."""
 
 _TYPES = {"float32": "Float32", "float64": "Float64", "uint8": "UInt8"}
 
 
 def write(path: Path, points: Points, progress: "Progress") -> None:
-    """Write all arrays as point data, the field as the active scalars: what a contour filter takes by itself.
+    """Write all arrays as point data, with the field as active scalars, which a contour filter uses by default.
 
     Points lie at origin + direction · (spacing · index), which readers from VTK 9.0 on know.
     """
@@ -77,7 +77,7 @@ _"""
 
 
 def _light(points: Points) -> str:
-    """How colours were made, as field data; nothing where there is no light."""
+    """Field data that describe the colours; nothing without light."""
     if points.albedo is None or points.exposure is None:
         return ""
     return f"""<FieldData>
@@ -118,7 +118,7 @@ class _Packed:
 
     @property
     def length(self) -> int:
-        """Bytes with the sizes in front."""
+        """Bytes, including the sizes in front."""
         return 8 * (3 + len(self.sizes)) + sum(self.sizes)
 
     def write_to(self, file: IO[bytes]) -> None:

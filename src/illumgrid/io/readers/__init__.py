@@ -1,7 +1,7 @@
 """Volumes from files and folders: one reader for each family of files (`families`), and scenes of volumes.
 
-A header is not believed: what it promises is held against the size of the file and the free memory before anything
-that large is allocated; every byte is counted, every checksum verified; files that a header names lie in its folder.
+A header is not trusted: its claims are compared with the size of the file and the free memory before memory is
+allocated; every byte is counted, every checksum verified; files that a header names must lie in its folder.
 """
 
 import importlib
@@ -44,7 +44,7 @@ UNREADABLE = (
         tokenize.TokenError,
     ),
 )
-"""What libraries raise on a file that is not what it should be."""
+"""Exceptions that libraries raise on a damaged or unsuitable file."""
 
 EXTRAS = {"SimpleITK": "itk", "h5py": "hdf5"}
 """Optional packages that read whole files, and the extra that brings each."""
@@ -53,7 +53,7 @@ EXTRAS = {"SimpleITK": "itk", "h5py": "hdf5"}
 def volume_name(path: str | os.PathLike[str]) -> str:
     """Name of a volume as shown to users: the file's name without its known suffixes, or the folder's name."""
     file = Path(os.path.abspath(path))
-    # Names on the disk are bytes: what is no UTF-8 in them cannot be printed, nor written into other files.
+    # File names are bytes: those that are not UTF-8 cannot be printed, nor written into other files.
     if file.is_dir() and file.suffix.lower() != ".zarr":
         return os.fsencode(file.name).decode("utf-8", "replace")
     file = Path(os.fsencode(file.name).decode("utf-8", "replace"))
@@ -84,7 +84,7 @@ def read_volume(
         OpenDX `.dx`, `.npy` or `.npz`, each also gzipped (`brain.nrrd.gz`); HDF5 (extra `hdf5`); or a folder: Zarr,
         OME-Zarr, one DICOM series, or TIFF slices.
     spacing : (3,) sequence of float, optional
-        Distance between voxels along x, y, z, in place of what the file says.
+        Distance between voxels along x, y, z, instead of that of the file.
     channel, time, array : int or str, optional
         Which one of a file that holds several: its number, from 0, or its name.
     label : int, optional
@@ -114,7 +114,7 @@ def read_volume(
     Warns
     -----
     IllumgridWarning
-        What was assumed or is lost.
+        About everything that was assumed or ignored.
     """
     if not os.fspath(path):
         raise BadInput(f"the name of the volume is empty; {EXPECTED}")  # and not the folder one is in
@@ -137,7 +137,7 @@ def read_volume(
 
 @contextmanager
 def named(file: Path, expected: str) -> Iterator[str]:
-    """Begin every refusal with the name of a file; whatever libraries raise on it is one. Gives the name to show."""
+    """Begin every message with the name of a file, also for exceptions of libraries. Yields the name to show."""
     shown = _printable(file.name.encode("utf-8", "replace").decode())
     try:
         yield shown
@@ -152,12 +152,12 @@ def named(file: Path, expected: str) -> Iterator[str]:
 
 
 def _printable(text: str) -> str:
-    """Without what a terminal would obey: names in headers and of files are not trusted."""
+    """Text without control characters: names in headers and of files are not trusted."""
     return "".join(c if c.isprintable() or c == "\0" else "?" for c in text)
 
 
 def _reason(problem: BaseException) -> str:
-    """What an exception says, in one line: ITK begins with its source file and an address; folders are left out."""
+    """The text of an exception on one line, without the source file and address of ITK and without folders."""
     text = re.sub(r"(?s).*(sitk::|ITK )ERROR:|\w+\(0x[0-9a-f]+\): |\. Reason: .*|/\S+/", "", str(problem))
     text = "".join(c if c.isprintable() else " " for c in text)
     return re.sub(r"[.!?:]+ ", ", ", " ".join(text.split())).rstrip(".!")[-200:] or type(problem).__name__
@@ -204,7 +204,7 @@ def _module(family: Family) -> Any:
         package = (problem.name or "").partition(".")[0]
         extra = f"pip install illumgrid[{EXTRAS[package]}]" if package in EXTRAS else f"install {package}"
         raise BadInput(
-            f"is read by the package {package}, which is not installed; expected it beside illumgrid: {extra}"
+            f"is read by the package {package}, which is not installed; expected it to be installed: {extra}"
         ) from problem
 
 

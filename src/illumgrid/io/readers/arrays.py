@@ -77,7 +77,7 @@ def _place(pack: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDArray[np.float64]:
 
 
 def _read_npy(stream: IO[bytes], most: int, wanted: Wanted) -> tuple[NDArray[Any], tuple[int, ...]]:
-    """What is wanted of the one array of a .npy stream that holds at most `most` bytes, and the shape of all of it."""
+    """The selection from the one array of a .npy stream of at most `most` bytes, and the shape of the whole array."""
     shape, fortran, dtype, start = header(stream)
     if dtype.kind not in "biuf":
         raise BadInput(f"the values have dtype {dtype}; expected real numbers; save the magnitude or one component")
@@ -97,7 +97,7 @@ def _read_npy(stream: IO[bytes], most: int, wanted: Wanted) -> tuple[NDArray[Any
 
 
 def three_axes(shape: tuple[int, ...], wanted: Wanted) -> tuple[list[int], list[Span]]:
-    """Which axes are x, y and z, and what is taken of the others.
+    """Which axes are x, y and z, and the index along each other axis.
 
     Of more than three axes `--time N` takes [N, ...], `--channel N` [..., N]; axes of length 1 are dropped.
     """
@@ -125,11 +125,11 @@ def header(stream: IO[bytes]) -> Header:
         raise BadInput("does not begin like a .npy array; expected what numpy.save writes; write it again")
     wide = start[6] > 1
     length: int = struct.unpack("<I", start[8:])[0] + 2 if wide else struct.unpack("<H", start[8:10])[0]
-    if length > 10_000:  # as NumPy: what is longer could hang the parser
+    if length > 10_000:  # as in NumPy: a longer header could block the parser
         raise BadInput(f"its .npy header claims {length} bytes; expected at most 10000; write it again")
     text = io.BytesIO(start[8:] + stream.read(length - 2))
     parse = np.lib.format.read_array_header_2_0 if wide else np.lib.format.read_array_header_1_0
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # Python 2 wrote sizes like 3L, which are as good
+        warnings.simplefilter("ignore")  # Python 2 wrote sizes like 3L, which are valid, too
         shape, fortran, dtype = parse(text)
     return shape, fortran, dtype, 10 + length

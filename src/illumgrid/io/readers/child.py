@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 _MOST = 10_000
-"""Datasets that are looked at."""
+"""Largest number of datasets that are examined."""
 
 ROOM = 1 << 29
 """Bytes of memory for headers, beyond what the process has at its start."""
@@ -25,8 +25,8 @@ def _taken() -> int:
 
 
 def _confine(base: int, asked: dict[str, Any]) -> None:
-    """End this process where a request takes more memory or time than its numbers explain."""
-    with suppress(ImportError, AttributeError, OSError, ValueError):  # Windows has no limits
+    """End this process if a request takes more memory or time than its size explains."""
+    with suppress(ImportError, AttributeError, OSError, ValueError):  # not available on Windows
         import resource
 
         signal.setitimer(signal.ITIMER_PROF, 10 + asked["bytes"] / 1e7)
@@ -94,7 +94,7 @@ def _index(asked: dict[str, Any]) -> tuple[Any, ...]:
 def _answers(kind: str, place: str) -> Iterator[tuple[dict[str, Any], bytes]]:
     """An answer to each request: a record, and the bytes of an array that it describes."""
     base, answer = 0, None
-    with suppress(OSError):  # no /proc on macOS
+    with suppress(OSError):  # macOS has no /proc
         base = _taken()
     for line in sys.stdin.buffer:
         try:

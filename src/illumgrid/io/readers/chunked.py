@@ -15,7 +15,7 @@ from illumgrid.io.readers.stored import Wanted, pick
 from illumgrid.io.readers.windows import Span, take
 
 AT_ONCE = 1 << 26
-"""Bytes that are read at a time, or one chunk."""
+"""Bytes, or one chunk, that are read at a time."""
 
 UNITS = {
     "micrometer": "µm", "micron": "µm", "microns": "µm", "um": "µm", "µm": "µm", "millimeter": "mm", "mm": "mm",
@@ -30,7 +30,7 @@ def axes_of(names: Sequence[str | None]) -> list[int] | None:
 
 
 def by_name(names: Sequence[str], shape: Sequence[int], wanted: Wanted) -> dict[int, int]:
-    """What is taken of the axes that are none of space: one time step, one channel, and the only one of others."""
+    """The index along axes that are not of space: one time step, one channel, and the only place of others."""
     chosen = {}
     for axis, (name, count) in enumerate(zip(names, shape)):
         if name in ("x", "y", "z"):
@@ -74,7 +74,7 @@ def read_box(
     out = room([span.count for span in spans], mean if averaged else kind.newbyteorder("="))
     tile = [max(1, chunks[axis] // span.block) for axis, span in zip(axes, spans)]  # in voxels of the result
     size = kind.itemsize * math.prod(n * span.block for n, span in zip(tile, spans))
-    for k in sorted(range(3), key=lambda k: -axes[k]):  # what lies closest together grows first
+    for k in sorted(range(3), key=lambda k: -axes[k]):  # the axis that is contiguous in the file grows first
         grown = min(spans[k].count, tile[k] * max(1, AT_ONCE // size))
         size, tile[k] = size // tile[k] * grown, grown
     starts = [range(0, span.count, n) for span, n in zip(spans, tile)]

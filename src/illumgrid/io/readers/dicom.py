@@ -1,6 +1,6 @@
 """DICOM by pydicom: a folder of slices, or one file of many frames.
 
-The series is put together here, because no header can be asked for it: frames are sorted along their normal, each has
+The series is assembled here, since no header describes it as a whole: frames are sorted along their normal, each has
 its own slope and intercept, and whatever does not lie on one even lattice is named.
 """
 
@@ -23,7 +23,7 @@ from illumgrid.io.readers.stored import Note, Stored, Wanted, pick
 from illumgrid.io.readers.windows import Span
 
 MOST_FILES = 200_000
-"""Files in a folder that are looked at: no series has more."""
+"""Largest number of files of a folder that are examined: no series has more."""
 
 IMAGES = ("Image Storage", "Dose Storage", "Segmentation Storage", "Map Storage")
 """Names of the classes whose objects hold pixels; reports, plans and contours do not."""
@@ -81,7 +81,7 @@ def _files(folder: Path) -> Iterator[Path]:
 
 
 def _is_dicom(source: Source) -> bool:
-    """By its mark; or, without the preamble of 128 bytes, by its first element."""
+    """Whether a file is DICOM: by its mark, or, without the preamble of 128 bytes, by its first element."""
     return source.head[128:132] == b"DICM" or bare_dicom(source.head)
 
 
@@ -98,7 +98,7 @@ def _frames(source: Source, names: dict[str, str] | None = None) -> list[Frame]:
         found = frames_of(header, source.file, source.most)
         uid = text(header, "SOPInstanceUID")
     if not found and not stored:
-        raise BadInput("does not say what object of DICOM it is, or ends before that; expected slices; copy it again")
+        raise BadInput("does not state its DICOM class, or ends before that; expected slices; copy it again")
     if not found and any(word in stored.name for word in IMAGES):
         raise BadInput(f"is a {stored.name} without pixels, or ends before them; expected whole slices; copy it again")
     if found and names is not None and uid:
@@ -110,7 +110,7 @@ def _frames(source: Source, names: dict[str, str] | None = None) -> list[Frame]:
 
 
 def _chosen(frames: Sequence[Frame], wanted: Wanted, sources: dict[Path, Source]) -> Stored:
-    """The volume that is left after the choice of series (array), phase (time) and colour (channel)."""
+    """The volume that remains after the choice of series (array), phase (time) and colour (channel)."""
     group, notes = _series(frames, wanted)
     if group[0].kind.segments:
         return _label_map(group, sources)
@@ -135,7 +135,7 @@ def _chosen(frames: Sequence[Frame], wanted: Wanted, sources: dict[Path, Source]
 
 
 def _series(frames: Sequence[Frame], wanted: Wanted) -> tuple[list[Frame], list[Note]]:
-    """The frames of the chosen series. Without a choice, single planes and localizers beside one stack are left out."""
+    """The frames of the chosen series; without a choice, single planes and localizers beside one stack are left out."""
     groups = stacks(frames)
     real = [group for group in groups if len(group) > 1 and not group[0].kind.scout]
     if wanted.array is None and len(real) == 1 and len(groups) > 1:
@@ -165,7 +165,9 @@ def _named(group: Sequence[Frame]) -> str:
 def _label_map(group: Sequence[Frame], sources: dict[Path, Source]) -> Stored:
     """A segmentation of masks as one map, each voxel with the number of its segment; 0 where there is none."""
     if not placed(group):
-        raise BadInput("a segmentation that does not say where its frames lie; expected positions; mend its header")
+        raise BadInput(
+            "a segmentation that does not state the position of its frames; expected positions; correct its header"
+        )
     places: dict[float, Frame] = {}
     axes = group[0].axes
     assert axes is not None

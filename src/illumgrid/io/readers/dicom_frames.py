@@ -1,4 +1,4 @@
-"""What a DICOM header says of each frame: its place, what its values mean, and how it differs from others there."""
+"""The properties of each frame in a DICOM header: its place, the meaning of its values, differences from others."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -28,19 +28,19 @@ VECTORS = {  # of multi-frame nuclear medicine, PS3.3 C.8.4.8
 }
 
 UNIFORM = 1e-3
-"""Directions whose components differ by less are one."""
+"""Directions whose components differ by less than this are equal."""
 
 
 @dataclass(frozen=True)
 class Kind:
-    """What all frames of one volume have in common."""
+    """The properties that all frames of one volume have in common."""
 
     series: str
     rows: int
     columns: int
     samples: int
     bits: int
-    """Allocated for each sample."""
+    """Bits allocated for each sample."""
     colours: str
     """Photometric interpretation."""
     what: str
@@ -67,7 +67,7 @@ class Frame:
     pixel: tuple[float, float] | None
     """Millimetres between columns (x) and between rows (y)."""
     gap: float | None
-    """Millimetres between slices, as the header has it."""
+    """Millimetres between slices, by the header."""
     slope: float
     intercept: float
     order: tuple[float, ...]
@@ -86,11 +86,11 @@ def numbers(item: Any, keyword: str, count: int | None = None) -> list[float] | 
             return None
         found = [float(v) for v in (value if isinstance(value, Sequence) and not isinstance(value, str) else [value])]
     except (ValueError, TypeError, OverflowError, AttributeError):
-        raise BadInput(f"its {keyword} is no number; expected one; mend its header") from None
+        raise BadInput(f"its {keyword} is not a number; expected one; correct its header") from None
     if not found:
         return None
     if count not in (None, len(found)) or not np.isfinite(found).all():
-        raise BadInput(f"its {keyword} is {found[:8]}; expected {count or 'some'} finite numbers; mend its header")
+        raise BadInput(f"its {keyword} is {found[:8]}; expected {count or 'some'} finite numbers; correct its header")
     return found
 
 
@@ -158,7 +158,7 @@ def _pixel(*items: Any) -> tuple[float, float] | None:
         for keyword in ("PixelSpacing", "NominalScannedPixelSpacing", "ImagerPixelSpacing"):
             if (found := numbers(item, keyword, 2)) is not None:
                 if min(found) <= 0:
-                    raise BadInput(f"its {keyword} is {found}; expected two positive numbers; mend its header")
+                    raise BadInput(f"its {keyword} is {found}; expected two positive numbers; correct its header")
                 return found[1], found[0]  # the standard names the distance between rows first
     return None
 

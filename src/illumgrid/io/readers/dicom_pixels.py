@@ -30,7 +30,7 @@ DEFLATED = "1.2.840.10008.1.2.1.99"
 
 @contextmanager
 def quiet() -> Iterator[list[Any]]:
-    """Collect pydicom's warnings: on oddities of headers they mean nothing here, on pixels they do."""
+    """Collect pydicom's warnings: irrelevant about headers here, relevant about pixels."""
     with warnings.catch_warnings(record=True) as collected:
         warnings.simplefilter("always")
         yield collected
@@ -38,7 +38,7 @@ def quiet() -> Iterator[list[Any]]:
 
 @contextmanager
 def _bytes(source: Source) -> Iterator[Any]:
-    """The file as something to seek in that gives no more bytes than it has, whatever length is asked for."""
+    """The file as a seekable object that never returns more bytes than it has, whatever length is requested."""
     if source.packed:
         with seekable(source) as stream:
             yield stream
@@ -49,7 +49,7 @@ def _bytes(source: Source) -> Iterator[Any]:
 
 @contextmanager
 def understood(part: str) -> Iterator[None]:
-    """Turn whatever pydicom raises on damaged bytes, at once or when a value is looked at, into a sentence."""
+    """Turn exceptions of pydicom on damaged bytes, immediate or at the access of a value, into a message."""
     try:
         yield
     except (BadInput, MemoryError):
@@ -64,7 +64,7 @@ def dataset(source: Source, header_only: bool) -> Any:
     """Read the data set of a file, with or without its pixels."""
     with quiet(), _bytes(source) as stream, understood("its DICOM header"):
         _check_deflated(stream, source)
-        # force: files without preamble; what is none was turned away by its first bytes
+        # force: for files without preamble; others were refused by their first bytes
         return pydicom.dcmread(stream, stop_before_pixels=header_only, force=True)
 
 
@@ -148,7 +148,7 @@ def decoded(
         if not any(word in data for word in ("PixelData", "FloatPixelData", "DoubleFloatPixelData")):
             raise BadInput(f"{name} ends before its pixels; {AGAIN}")
         _check_packed(data, name)
-        if kind.bits == 1:  # frames need not begin at a whole byte, which iter_pixels asks for
+        if kind.bits == 1:  # frames need not begin at a whole byte, as iter_pixels requires
             bits = pixel_array(data).reshape(-1, kind.rows, kind.columns)
             yield from ((index, bits[index]) for index in indices)
             return
@@ -187,7 +187,7 @@ def _check_packed(data: Any, name: str) -> None:
     if not decoder.is_available:
         raise BadInput(
             f"its pixels are packed as {shown}, which needs packages that are not installed; expected them "
-            "beside illumgrid: pip install illumgrid[dicom]"
+            "to be installed: pip install illumgrid[dicom]"
         )
     if not syntax.is_encapsulated and "PixelData" in data:
         promised, held = get_expected_length(data), len(data.PixelData)

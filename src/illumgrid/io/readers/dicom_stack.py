@@ -1,4 +1,4 @@
-"""From frames to one stack: which belong together, which are the same places again, and where each slice lies."""
+"""From frames to one stack: which belong together, which repeat the same places, and where each slice lies."""
 
 import itertools
 from collections import Counter, defaultdict
@@ -13,16 +13,16 @@ from illumgrid.io.readers.dicom_frames import UNIFORM, Frame
 from illumgrid.io.readers.stored import Note
 
 ON_PLACE = 0.02
-"""A slice this near to its place on the even lattice, in slices, is there: positions are written with few digits."""
+"""A slice this near to its place on the even lattice, in slices, counts as on it: positions have few digits."""
 
 ASIDE = "first pixel in the plane at"
-"""What tells fields of view beside each other from each other."""
+"""Attribute that distinguishes adjacent fields of view."""
 
 REPEAT = "repeat"
-"""Names volumes at the same places that no attribute tells from each other."""
+"""Attribute that distinguishes volumes at the same places if no other does."""
 
 LONGEST_GAP = 3
-"""Slices; what is missing between two slices is interpolated up to this, and beyond it refused."""
+"""Slices: gaps up to this many are interpolated, longer ones refused."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ def _parallel(a: Frame, b: Frame) -> bool:
 
 
 def depths(frames: Sequence[Frame]) -> Floats:
-    """Where each frame lies along the normal (n,), millimetres."""
+    """Position of each frame along the normal (n,), millimetres."""
     first = frames[0]
     assert first.axes is not None
     normal = np.cross(first.axes[0], first.axes[1])
@@ -76,12 +76,12 @@ def depths(frames: Sequence[Frame]) -> Floats:
 
 
 def placed(frames: Sequence[Frame]) -> bool:
-    """Whether each frame says where it lies."""
+    """Whether each frame states its position."""
     return all(frame.position is not None and frame.axes is not None for frame in frames)
 
 
 def phases(frames: Sequence[Frame]) -> list[tuple[str, list[Frame]]]:
-    """Parts of a stack that each hold every place once, with what tells them from each other."""
+    """Parts of a stack that each contain every place once, with the attributes that distinguish them."""
     if not placed(frames) or len(frames) < 2:
         return [("", list(frames))]
     depth = depths(frames)
@@ -98,7 +98,7 @@ def phases(frames: Sequence[Frame]) -> list[tuple[str, list[Frame]]]:
         sizes = [Counter(places[members].tolist()) for members in parts.values()]
         if len(parts) == most and all(max(size.values()) == 1 for size in sizes):
             return [(name, [frames[k] for k in members]) for name, members in parts.items()]
-    # Nothing in the header tells them from each other but their order.
+    # The headers distinguish them only by their order.
     seen: Counter[int] = Counter()
     ranked: dict[int, list[Frame]] = defaultdict(list)
     for k in sorted(range(len(frames)), key=lambda k: (frames[k].order, frames[k].file.name, frames[k].index)):
@@ -148,7 +148,7 @@ def _even(depth: Floats) -> bool:
 
 
 def arranged(frames: Sequence[Frame]) -> Stack:
-    """Order slices along their normal onto an even lattice; say what is missing, uneven or tilted."""
+    """Order slices along their normal onto an even lattice, with notes about missing, uneven or tilted ones."""
     if not placed(frames):
         return _unplaced(frames)
     depth = depths(frames)
@@ -159,7 +159,7 @@ def arranged(frames: Sequence[Frame]) -> Stack:
     assert axes is not None and frames[0].position is not None
     if pixel is None:
         pixel = (1.0, 1.0)
-        notes = [*notes, ("spacing", "does not say how large its pixels are; 1 mm was assumed; give --spacing X Y Z")]
+        notes = [*notes, ("spacing", "does not state the size of its pixels; 1 mm was assumed; give --spacing X Y Z")]
     positions = np.array([frame.position for frame in frames])
     drift, more = _drift((positions - positions[0]) @ axes.T, depth - depth[0], step, np.array(pixel))
     along = step * np.cross(axes[0], axes[1]) + drift @ axes
@@ -179,7 +179,10 @@ def _unplaced(frames: Sequence[Frame]) -> Stack:
         assumed += f", {step:g} mm from slice to slice and {pixel[0]:g} x {pixel[1]:g} mm in the plane"
         gap = step
     steps = np.stack([pixel[0] * axes[0], pixel[1] * axes[1], gap * np.cross(axes[0], axes[1])], axis=1)
-    note = ("dicom", f"its header does not say where its slices lie (no ImagePositionPatient); assumed: {assumed}")
+    note = (
+        "dicom",
+        f"its header does not state the position of its slices (no ImagePositionPatient); assumed: {assumed}",
+    )
     return Stack(tuple(frames), np.arange(len(frames), dtype=float), len(frames), np.zeros(3), steps, (note,))
 
 
@@ -202,7 +205,7 @@ def _lattice(depth: Floats, gap: float | None) -> tuple[Floats, int, float, list
     far = int(np.argmax(distances))
     if distances[far] > (LONGEST_GAP + 1.5) * min(step, float(np.median(distances))):
         raise BadInput(
-            f"between its slices {depth[far]:.6g} and {depth[far + 1]:.6g} mm along their normal there is nothing, "
+            f"there is a gap between its slices {depth[far]:.6g} and {depth[far + 1]:.6g} mm along their normal, "
             f"others are {np.median(distances):.6g} mm from each other; expected one stack without such a gap; give a "
             "folder with only the slices on one side"
         )

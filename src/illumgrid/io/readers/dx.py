@@ -41,14 +41,16 @@ def read(source: Source, wanted: Wanted) -> Stored:
         else:
             raise BadInput(f"ends before its data; {AGAIN}")
         if len(shape) != 3 or len(steps) != 3:
-            raise BadInput("says not how large its grid is; expected gridpositions with three counts and three deltas")
+            raise BadInput(
+                "does not state the size of its grid; expected gridpositions with three counts and three deltas"
+            )
         check_axes(shape)
         count = math.prod(shape)
         dtype = _type(line, count)
         check_memory(count * (8 + AS_FLOAT))
         if dtype is None:
             check_size(count * 2, source.most, 0)  # a number and a space take two bytes at least
-            values = read_text(stream, count)[0].reshape(shape)  # objects that follow say how it is connected
+            values = read_text(stream, count)[0].reshape(shape)  # further objects describe how the points are connected
         else:
             check_size(count * dtype.itemsize, source.most, 0)
             values = read_array(stream, dtype, shape, "C")

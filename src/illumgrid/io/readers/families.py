@@ -1,4 +1,4 @@
-"""The families of files that hold volumes: how each is recognised, which module reads it, what one can choose in it."""
+"""The families of files that hold volumes: how each is recognised, which module reads it, and what users can choose."""
 
 import re
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ class Family:
     """Within `illumgrid.io.readers`; imported where it is needed."""
     endings: tuple[str, ...]
     starts: tuple[tuple[int, bytes], ...] = ()
-    """Bytes at a place, each of which says that a file is of this family, whatever its name."""
+    """Bytes at an offset, each of which identifies the family whatever the file's name."""
     chooses: tuple[str, ...] = ()
     """Options that choose one volume of several: channel, time, array."""
     medical: bool = False
@@ -91,7 +91,7 @@ OTHERS = {
     b"<!DOCTYPE": "a web page",
     b"<html": "a web page",
 }
-"""Beginnings of files of other kinds, and what those are."""
+"""First bytes of files of other kinds, and their kinds."""
 
 EXPECTED = (
     "expected NRRD, NIfTI, MetaImage, TIFF, MRC, legacy VTK, .vti, .cube, .dx, .npy, .npz or HDF5, or a folder of "
@@ -102,19 +102,19 @@ SUFFIXES = {ending for family in FAMILIES for ending in family.endings}
 
 
 _REPRESENTATIONS = {b"CS", b"UI", b"UL", b"OB", b"DA", b"TM", b"LO", b"SH"}
-"""Kinds of values that the first element of a DICOM file may have."""
+"""Types of values that the first element of a DICOM file may have."""
 
 
 def bare_dicom(head: bytes) -> bool:
     """Whether a file begins like DICOM without its preamble of 128 bytes: by an element of group 2 or 8."""
     if len(head) < 256 or head[:2] not in (b"\x02\0", b"\x08\0") or head[3] != 0:
         return False
-    # Either the kind of the value comes next, or, for few bytes, its length.
+    # The type of the value follows, or, without one, a length of few bytes.
     return head[4:6] in _REPRESENTATIONS or (head[2] <= 0x18 and 0 < int.from_bytes(head[4:8], "little") <= 128)
 
 
 def family_of(source: Source) -> Family:
-    """The family of a file: its first bytes count, then the ending of its name."""
+    """The family of a file: by its first bytes, then by the ending of its name."""
     for family in FAMILIES:
         if any(source.head[at : at + len(mark)] == mark for at, mark in family.starts):
             return family

@@ -36,7 +36,7 @@ def _by_itk(source: Source, wanted: Wanted) -> Stored:
         from illumgrid.io.readers import itk
     except ImportError:
         raise BadInput(
-            "an image that ITK wrote, which SimpleITK reads; expected it beside illumgrid: pip install illumgrid[itk]"
+            "an image that ITK wrote, which SimpleITK reads; expected it to be installed: pip install illumgrid[itk]"
         ) from None
     for option in ("channel", "time", "array"):
         if getattr(wanted, option) is not None:
@@ -64,6 +64,6 @@ def _read(file: Isolated, name: str, wanted: Wanted) -> Stored:
     elif len(sizes) == 3:
         steps, unit = sizes[np.argsort(np.argsort(order))], "µm"
     else:
-        notes = (("spacing", "it does not say the distance between voxels: 1 is taken; give --spacing"),)
+        notes = (("spacing", "it does not state the distance between voxels: 1 is assumed; give --spacing"),)
     values = read_box(data, data.chunks, order, chosen, wanted.spans(space))
     return Stored(values, np.zeros(3), np.diag(steps), unit=unit, notes=notes, whole=space)

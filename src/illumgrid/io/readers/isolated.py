@@ -1,4 +1,4 @@
-"""HDF5, and Zarr with codecs that fuzzing shows to crash, in a process of their own: a crash is a sentence.
+"""HDF5, and Zarr with codecs that fuzzing makes crash, are read in a process of their own: a crash becomes a message.
 
 The process has limits of memory and time for each request; it hands over raw bytes and JSON, and nothing is unpickled.
 """
@@ -29,7 +29,7 @@ class Isolated:
         self.process = process
 
     def ask(self, packed: bytes = b"", size: int = 0, **what: Any) -> Any:
-        """The answer to a request that explains so many bytes of memory: a record, or an array."""
+        """The answer to a request with its limit in bytes of memory: a record, or an array."""
         to, of = self.process.stdin, self.process.stdout
         assert to is not None and of is not None
         try:
@@ -41,7 +41,7 @@ class Isolated:
                 raise EOFError
         except (OSError, EOFError, json.JSONDecodeError):
             if self.process.wait() == -getattr(signal, "SIGPROF", 0):
-                raise BadInput(f"keeps the library that reads it at work for ever: it is damaged; {AGAIN}") from None
+                raise BadInput(f"keeps the library that reads it busy without end: it is damaged; {AGAIN}") from None
             raise BadInput(f"ended the library that reads it by a crash: it is damaged; {AGAIN}") from None
         if "memory" in record:
             raise BadInput(f"asks for more memory than its numbers explain: it is damaged; {AGAIN}")

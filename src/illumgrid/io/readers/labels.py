@@ -35,11 +35,11 @@ def distance_to(stored: Stored, label: int) -> Stored:
 
     Notes
     -----
-    Between the centres of voxels inside and outside a surface could lie anywhere; a mask puts it half-way, in steps.
-    Here the signed distance d is blurred, G d, and what the blur takes away where surfaces are curved is given back,
-    G d + G(d - G d). Each centre of a voxel stays on its side. Measured (docs/files.md): balls of 6 to 24 voxels keep
-    their radius within 0.02 voxels; points of their surface are off by 0.06 voxels (root mean square; 0.20 for the
-    mask), normals by 3.2° at most (21°).
+    The surface may lie anywhere between the centres of voxels inside and outside; a mask puts it half-way, in steps.
+    Here the signed distance d is blurred, G d, and the shrinkage of curved surfaces by the blur is compensated,
+    G d + G(d - G d). The centre of each voxel stays on its side. Measured (docs/files.md): balls of 6 to 24 voxels keep
+    their radius within 0.02 voxels; the error is 0.06 voxels at points of their surface (root mean square; 0.20 for
+    the mask) and at most 3.2° for normals (21° for the mask).
     """
     from scipy.ndimage import distance_transform_edt, gaussian_filter
 
@@ -65,7 +65,7 @@ def distance_to(stored: Stored, label: int) -> Stored:
 
 
 def _around(inside: "np.ndarray[tuple[int, ...], np.dtype[np.bool_]]") -> tuple[slice, ...]:
-    """The box of what is inside, and a margin."""
+    """The bounding box of the inside, with a margin."""
     box = []
     for axis in range(3):
         there = np.flatnonzero(inside.any(axis=tuple({0, 1, 2} - {axis})))

@@ -1,4 +1,4 @@
-"""What a header may promise: no more than its file can hold, nor than fits into the memory that is free."""
+"""Limits for the claims of a header: no more than its file can contain and than fits into the free memory."""
 
 import contextlib
 import os
@@ -14,11 +14,11 @@ CHUNK = 1 << 20
 """Bytes read at a time."""
 
 AS_FLOAT = 4
-"""Bytes that a voxel takes as a volume keeps it."""
+"""Bytes per voxel in memory."""
 
 
 def check_axes(shape: Sequence[int]) -> None:
-    """Refuse what is not three axes of at least 2 voxels."""
+    """Refuse shapes other than three axes of at least 2 voxels."""
     size = "x".join(map(str, shape))
     if len(shape) != 3:
         todo = "choose one time step or channel" if len(shape) > 3 else "stack the slices"
@@ -29,7 +29,7 @@ def check_axes(shape: Sequence[int]) -> None:
 
 
 def check_size(promised: int, held: int, memory: int) -> None:
-    """Refuse a header that promises more bytes than the file can hold, or that needs more memory than is free."""
+    """Refuse a header that promises more bytes than the file can contain, or that needs more memory than is free."""
     if promised > held:
         raise BadInput(
             f"ends too early: its header promises {promised} bytes of data, the file can hold {held}; expected a whole "
@@ -39,7 +39,7 @@ def check_size(promised: int, held: int, memory: int) -> None:
 
 
 def check_memory(need: int) -> None:
-    """Refuse what needs more bytes of memory than are free."""
+    """Refuse data that need more bytes of memory than are free."""
     if need > (free := free_memory()):
         raise BadInput(
             f"needs {gigabytes(need)} of memory, {gigabytes(free)} are free; expected less; read a part with --crop or "
@@ -77,7 +77,7 @@ def _available() -> int:
 
 
 def _left_in_groups() -> list[int]:
-    """What is left to this process in each control group above it that has a limit (containers, batch systems)."""
+    """Free memory for this process in each control group above it that has a limit (containers, batch systems)."""
     left = []
     try:
         groups = [line.split(":", 2) for line in Path("/proc/self/cgroup").read_text("utf-8").splitlines()]
@@ -98,7 +98,7 @@ def _left_in_groups() -> list[int]:
 
 
 def _left_in(group: Path, most: str, used: str) -> list[int]:
-    """What a control group has left, where it has a limit: pages of files, as of a field that is paged, give way."""
+    """Free memory of a control group with a limit; pages of files, as of a paged field, count as free."""
     limit = (group / f"memory.{most}").read_text("ascii").strip()
     if limit == "max":
         return []

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 ENDINGS = (".ply", ".stl", ".obj", ".glb")
 
 Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
-"""World to glTF: its up, +y, is the world's +z, and its front, +z, the world's -y (in LPS, the face)."""
+"""World axes in glTF: its up, +y, is the world's +z, and its front, +z, the world's -y (in LPS, the face)."""
 
 
 def read_mesh(path: str | os.PathLike[str]) -> "trimesh.Trimesh":
@@ -29,7 +29,7 @@ def read_mesh(path: str | os.PathLike[str]) -> "trimesh.Trimesh":
     Raises
     ------
     BadInput
-        If it is no such file, or holds no triangles.
+        If it is not such a file, or contains no triangles.
     """
     import trimesh
 

@@ -76,9 +76,9 @@ def _header(stream: IO[bytes]) -> tuple[Fields, list[str]]:
         line = stream.readline(LONGEST)
         key, equals, value = line.decode("utf-8", "surrogateescape").partition("=")
         if (not equals and line.strip()) or len(line) == LONGEST or len(fields) > 1000:
-            raise BadInput("its header has a line that is not KEY = VALUE; expected a MetaImage header; mend it")
+            raise BadInput("its header has a line that is not KEY = VALUE; expected a MetaImage header; correct it")
         if not line:
-            raise BadInput("its header ends without ElementDataFile; expected where its data are; mend the header")
+            raise BadInput("its header ends without ElementDataFile; expected where its data are; correct the header")
         if line.strip():
             fields[key.strip()] = value.strip()
     names = []
@@ -94,7 +94,7 @@ def _whole_numbers(fields: Fields, key: str, count: int) -> tuple[int, ...]:
     words = fields.get(key, "").split()
     if len(words) != count or not all(re.fullmatch(r"-?\d{1,18}", word) for word in words):
         raise BadInput(
-            f"its {key} is {fields.get(key, 'missing')[:60]!r}; expected {count} whole numbers; mend its header"
+            f"its {key} is {fields.get(key, 'missing')[:60]!r}; expected {count} whole numbers; correct its header"
         )
     return tuple(int(word) for word in words)
 
@@ -104,7 +104,7 @@ def _one(fields: Fields, key: str, low: int, high: int, default: int | None = No
         return default
     (number,) = _whole_numbers(fields, key, 1)
     if not low <= number <= high:
-        raise BadInput(f"its {key} is {number}; expected a number from {low} to {high}; mend its header")
+        raise BadInput(f"its {key} is {number}; expected a number from {low} to {high}; correct its header")
     return number
 
 
@@ -116,7 +116,7 @@ def _numbers(fields: Fields, keys: tuple[str, ...], count: int) -> NDArray[np.fl
             except ValueError:
                 found = np.zeros(0)
             if len(found) != count:
-                raise BadInput(f"its {key} is {fields[key][:60]!r}; expected {count} numbers; mend its header")
+                raise BadInput(f"its {key} is {fields[key][:60]!r}; expected {count} numbers; correct its header")
             return found
     return None
 
@@ -131,7 +131,7 @@ def _place(fields: Fields, axes: int) -> tuple[tuple[NDArray[Any], NDArray[Any]]
     spacing = _numbers(fields, ("ElementSpacing", "ElementSize"), axes)
     if spacing is None:
         spacing = np.ones(axes)
-        notes = (("spacing", "does not say how far its voxels are from each other; 1, 1, 1 was taken; give --spacing"),)
+        notes = (("spacing", "does not state the distance between its voxels; 1, 1, 1 was assumed; give --spacing"),)
     matrix = _numbers(fields, ("TransformMatrix", "Rotation", "Orientation"), axes * axes)
     turn = np.eye(3) if matrix is None else matrix.reshape(axes, axes)[:3, :3].T
     origin = _numbers(fields, ("Offset", "Position", "Origin"), axes)
@@ -164,7 +164,9 @@ def _data(
         return part(source, stream, True, wanted)
     names = names or _pattern(named) or [named]
     if len(names) > 1 and len(names) != shape[-1]:
-        raise BadInput(f"its data are in {len(names)} files, but it has {shape[-1]} slices; expected one each; mend it")
+        raise BadInput(
+            f"its data are in {len(names)} files, but it has {shape[-1]} slices; expected one each; correct it"
+        )
     if len(names) == 1:
         file = beside(source, names[0], follow)
         with opened(file) as data:
@@ -189,7 +191,7 @@ def _pattern(named: str) -> list[str]:
     if not found:
         raise BadInput(
             f"its ElementDataFile is {named[:60]!r}; expected a name, LIST, or a pattern with one number such as "
-            "'slice%03d.raw 1 20 1'; mend its header"
+            "'slice%03d.raw 1 20 1'; correct its header"
         )
     before, width, after, first, last, step = found.groups(default="1")
     numbers = range(int(first), int(last) + 1, max(1, int(step)))

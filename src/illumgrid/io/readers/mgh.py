@@ -23,7 +23,7 @@ def read(source: Source, wanted: Wanted) -> Stored:
         block = stream.read(HEADER)
         if len(block) < HEADER:
             raise BadInput(f"ends within its header; {AGAIN}")
-        # nibabel's header is the beginning of ours and a footer of 20 bytes, which says nothing about places.
+        # nibabel's header is the beginning of the file's header and a footer of 20 bytes without placement.
         header = MGHHeader(block[: MGHHeader.template_dtype.itemsize - 20] + bytes(20), check=False)
         sizes = [int(n) for n in header["dims"]]
         if int(header["version"]) != 1 or int(header["type"]) not in (0, 1, 3, 4) or min(sizes) < 1:

@@ -65,7 +65,7 @@ def read(source: Source, wanted: Wanted) -> Stored:
 
 
 def _header(block: bytes) -> Any:
-    """The header in the byte order that makes sense of it: the machine stamp of old files says little."""
+    """The header in the byte order in which it is valid: the machine stamp of old files is unreliable."""
     from mrcfile.dtypes import HEADER_DTYPE
 
     for order in "<>":
@@ -76,7 +76,7 @@ def _header(block: bytes) -> Any:
 
 
 def _dtype(header: Any) -> np.dtype[Any]:
-    """Type of the numbers; mode 0 has signs, by the standard, unless the header's own extremes say otherwise."""
+    """Type of the numbers; mode 0 is signed, by the standard, unless the header's own extremes contradict."""
     from mrcfile.utils import dtype_from_mode
 
     mode = int(header["mode"])
@@ -98,7 +98,7 @@ def _volumes(header: Any, sections: int) -> int:
     if int(header["ispg"]) < 401:
         return 1
     if depth < 1 or sections % depth:
-        raise BadInput(f"a stack of {sections} sections in volumes of {depth}; expected a multiple; mend its header")
+        raise BadInput(f"a stack of {sections} sections in volumes of {depth}; expected a multiple; correct its header")
     return sections // depth
 
 
@@ -108,7 +108,7 @@ def _order(header: Any) -> tuple[int, int, int]:
     if stored == (0, 0, 0):
         stored = (1, 2, 3)
     if sorted(stored) != [1, 2, 3]:
-        raise BadInput(f"its axes are stored in the order {stored}; expected each of 1, 2, 3; mend its header")
+        raise BadInput(f"its axes are stored in the order {stored}; expected each of 1, 2, 3; correct its header")
     x, y, z = (stored.index(axis) for axis in (1, 2, 3))
     return x, y, z
 
@@ -116,10 +116,10 @@ def _order(header: Any) -> tuple[int, int, int]:
 def _axis_notes(header: Any) -> tuple[Note, ...]:
     if int(header["mapc"]) == int(header["mapr"]) == int(header["maps"]) == 0:
         return (
-            ("placement", "does not say in which order its axes are; columns, rows, sections were taken for x, y, z"),
+            ("placement", "does not state the order of its axes; columns, rows, sections were assumed to be x, y, z"),
         )
     if int(header["ispg"]) == 0 and int(header["mz"]) == 1 and int(header["nz"]) > 1:
-        return (("file", "calls itself a stack of images; they were taken for slices of a volume"),)
+        return (("file", "calls itself a stack of images; they were read as slices of a volume"),)
     return ()
 
 
@@ -135,12 +135,12 @@ def _place(header: Any, order: tuple[int, int, int]) -> tuple[Floats, Floats, Fl
     sampling = np.where(sampling > 0, sampling, held)
     spacing = cell / sampling
     if not (np.isfinite(spacing).all() and (spacing > 0).all()):
-        notes = (("spacing", "does not say how large its cell is; 1, 1, 1 was taken; give --spacing"),)
+        notes = (("spacing", "does not state the size of its cell; 1, 1, 1 was assumed; give --spacing"),)
         spacing = np.ones(3)
     if not np.isfinite(angles).all() or not ((angles > 0) & (angles < 180)).all():
         if np.any(angles):
             said = ", ".join(f"{a:g}" for a in angles)
-            notes = (*notes, ("placement", f"its cell angles are {said} degrees; right angles were taken"))
+            notes = (*notes, ("placement", f"its cell angles are {said} degrees; right angles were assumed"))
         angles = np.full(3, 90.0)
     steps = _cell(angles) * spacing
     starts = np.array([int(header[name]) for name in ("nxstart", "nystart", "nzstart")], float)[list(order)]
@@ -149,7 +149,7 @@ def _place(header: Any, order: tuple[int, int, int]) -> tuple[Floats, Floats, Fl
     if not origin.any():
         return by_starts, steps, starts, notes
     if starts.any() and np.abs(origin - by_starts).max() > 0.5 * spacing.max():
-        notes = (*notes, ("placement", "its origin and its starts differ; the origin was taken"))
+        notes = (*notes, ("placement", "its origin and its starts differ; the origin was used"))
     return origin, steps, None, notes
 
 

@@ -35,7 +35,9 @@ def read(source: Source, wanted: Wanted) -> Stored:
     try:
         return _read(source, wanted)
     except HeaderDataError as problem:
-        raise BadInput(f"its header is not that of a NIfTI file ({problem}); expected a valid one; mend it") from None
+        raise BadInput(
+            f"its header is not that of a NIfTI file ({problem}); expected a valid one; correct it"
+        ) from None
 
 
 def _read(source: Source, wanted: Wanted) -> Stored:
@@ -99,7 +101,7 @@ def _header(stream: IO[bytes]) -> Any:
         kind, length = nibabel.Nifti1Header, 348
     else:
         raise BadInput(
-            "does not begin like a NIfTI or Analyze header; expected 348 or 540 as its size; look what it is"
+            "does not begin like a NIfTI or Analyze header; expected 348 or 540 as its size; check what it is"
         )
     block = start + stream.read(length - 4)
     if len(block) < length:
@@ -134,11 +136,13 @@ def _place(header: Any) -> tuple[tuple[NDArray[np.float64], NDArray[np.float64]]
     far = float(np.linalg.norm(between, axis=1).max() / min(header.get_zooms()[:3]))
     if far < SAME:
         return in_lps(qform), ()
-    text = f"its qform and sform place a voxel up to {far:.3g} voxels differently; the sform was taken, as nibabel does"
+    text = f"its qform and sform place a voxel up to {far:.3g} voxels differently; the sform was used, as nibabel does"
     return in_lps(sform), ((("placement", text),) if far > FAR else ())
 
 
-_UNPLACED = "which does not say how its axes lie: x to the left and the middle at 0 was taken, as nibabel does"
+_UNPLACED = (
+    "which does not state the orientation of its axes: x to the left and the middle at 0 was assumed, as nibabel does"
+)
 
 
 def in_lps(affine: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

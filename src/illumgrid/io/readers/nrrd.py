@@ -58,12 +58,12 @@ Fields = Mapping[str, str]
 
 
 def read(source: Source, wanted: Wanted) -> Stored:
-    """Read one volume of a NRRD: of axes that are not of space, the user chooses."""
+    """Read one volume of a NRRD; along axes other than those of space, the user chooses."""
     with opened(source) as stream:
         fields, names = _header(stream)
         axes = _whole(fields, "dimension", 1)[0]
         if not 1 <= axes <= 16:
-            raise BadInput(f"its dimension is {axes}; expected three axes of space, and few others; mend its header")
+            raise BadInput(f"its dimension is {axes}; expected three axes of space, and few others; correct its header")
         sizes = _whole(fields, "sizes", axes)
         kind = fields.get("type", "").lower()
         if kind not in TYPES:
@@ -97,13 +97,11 @@ def _header(stream: IO[bytes]) -> tuple[Fields, list[str]]:
         text = line.decode("utf-8", "surrogateescape").strip()
         key, colon, value = text.partition(":")
         if len(line) == LONGEST or len(fields) > 1000:
-            raise BadInput(
-                "its header has a line or a number of lines that is not to be believed; expected a NRRD header"
-            )
+            raise BadInput("its header has a line that is too long, or too many lines; expected a NRRD header")
         if text.startswith("#") or value.startswith("="):
             continue
         if not colon:
-            raise BadInput(f"its header has the line {text[:40]!r}; expected 'field: value'; mend its header")
+            raise BadInput(f"its header has the line {text[:40]!r}; expected 'field: value'; correct its header")
         name = {"datafile": "data file", "lineskip": "line skip", "byteskip": "byte skip"}.get(key.lower(), key.lower())
         fields[{"centerings": "centers", "axismins": "axis mins", "axismaxs": "axis maxs"}.get(name, name)] = (
             value.strip()
@@ -122,7 +120,7 @@ def _whole(fields: Fields, key: str, count: int) -> tuple[int, ...]:
     words = fields.get(key, "").split()
     if len(words) != count or not all(re.fullmatch(r"\d{1,18}", word) for word in words):
         raise BadInput(
-            f"its field {key!r} is {fields.get(key, 'missing')[:60]!r}; expected {count} whole numbers; mend it"
+            f"its field {key!r} is {fields.get(key, 'missing')[:60]!r}; expected {count} whole numbers; correct it"
         )
     return tuple(int(word) for word in words)
 
@@ -132,7 +130,7 @@ def _vector(text: str) -> NDArray[np.float64]:
     try:
         return np.array([float(word) for word in text.strip("() \t").split(",")])
     except ValueError:
-        raise BadInput(f"its header has the vector {text[:40]!r}; expected numbers like (1,0,0); mend it") from None
+        raise BadInput(f"its header has the vector {text[:40]!r}; expected numbers like (1,0,0); correct it") from None
 
 
 def _directions(fields: Fields, axes: int) -> list[NDArray[np.float64] | None] | None:
@@ -142,7 +140,7 @@ def _directions(fields: Fields, axes: int) -> list[NDArray[np.float64] | None] |
         return None
     vectors = re.findall(r"\([^)]*\)|none|nan", text, re.IGNORECASE)
     if len(vectors) != axes:
-        raise BadInput(f"its space directions are {text[:60]!r}; expected {axes} vectors; mend its header")
+        raise BadInput(f"its space directions are {text[:60]!r}; expected {axes} vectors; correct its header")
     found = [_vector(v) if v.startswith("(") else None for v in vectors]
     return [None if v is None or np.isnan(v).all() else v for v in found]
 
@@ -197,20 +195,20 @@ def _place(
         vectors = [v for axis in spatial if (v := directions[axis]) is not None]
         if any(len(v) not in (3, 4) for v in vectors):
             raise BadInput(
-                f"its space directions are {fields['space directions'][:60]!r}; expected vectors of 3; mend it"
+                f"its space directions are {fields['space directions'][:60]!r}; expected vectors of 3; correct it"
             )
         steps = np.stack([v[:3] for v in vectors], axis=1)
         text = fields.get("space origin")
         origin = np.zeros(3) if text is None or "none" in text else _vector(text)[:3]
         if len(origin) != 3:
-            raise BadInput(f"its space origin is {text!r}; expected a vector of 3; mend its header")
+            raise BadInput(f"its space origin is {text!r}; expected a vector of 3; correct its header")
         return (signs * origin, signs[:, None] * steps), ()
     spacing, low = _spacing(fields, spatial, sizes)
     notes: tuple[Note, ...] = ()
     if np.isnan(spacing).any():
         taken = np.where(np.isnan(spacing), 1.0, spacing)
         said = ", ".join(f"{s:g}" for s in taken)
-        notes = (("spacing", f"does not say how far its voxels are from each other; {said} was taken; give --spacing"),)
+        notes = (("spacing", f"does not state the distance between its voxels; {said} was assumed; give --spacing"),)
         spacing = taken
     return (signs * np.where(np.isnan(low), 0.0, low), np.diag(signs * spacing)), notes
 
@@ -224,7 +222,7 @@ def _per_axis(fields: Fields, key: str, axes: int) -> NDArray[np.float64]:
     except ValueError:
         found = np.zeros(0)
     if len(found) != axes:
-        raise BadInput(f"its field {key!r} is {fields[key][:60]!r}; expected {axes} numbers; mend its header")
+        raise BadInput(f"its field {key!r} is {fields[key][:60]!r}; expected {axes} numbers; correct its header")
     return found
 
 
@@ -287,7 +285,9 @@ def _data(
         with opened(file) as data:
             return part(file, data, wanted)
     if len(names) != sizes[-1]:
-        raise BadInput(f"its data are in {len(names)} files, but it has {sizes[-1]} slices; expected one each; mend it")
+        raise BadInput(
+            f"its data are in {len(names)} files, but it has {sizes[-1]} slices; expected one each; correct it"
+        )
     files, more = [beside(source, name, follow) for name in names], [0]
     check_memory(need(dtype, sizes, wanted))
 

@@ -15,19 +15,19 @@ from illumgrid.errors import BadInput
 from illumgrid.io.readers import limits
 
 SHARE = 4
-"""An array is kept in memory up to one part in so many of what is free."""
+"""An array is kept in memory if it takes up to this fraction of the free memory (one part in so many)."""
 
 TURNED = 1 << 28
-"""Bytes of an array that are turned at a time, where axes are exchanged."""
+"""Bytes of an array that are transposed at a time."""
 
 
 def resident(size: int) -> int:
-    """Bytes of memory that an array of so many takes: what is paged takes none that others could not have."""
+    """Bytes of memory that an array of this size takes: a paged one takes none that others could not have."""
     return size if size <= limits.free_memory() // SHARE else min(size, limits.CHUNK)
 
 
 def room(shape: Sequence[int], dtype: DTypeLike, order: Literal["C", "F"] = "C") -> NDArray[Any]:
-    """Zeros; a large array lies in the folder for temporary files, without a name, and goes with the process.
+    """Zeros; a large array lies in a nameless file in the folder for temporary files, and disappears with the process.
 
     Raises
     ------
@@ -40,22 +40,22 @@ def room(shape: Sequence[int], dtype: DTypeLike, order: Literal["C", "F"] = "C")
     place = gettempdir()
     if size > shutil.disk_usage(place).free:
         raise BadInput(
-            f"needs {limits.gigabytes(size)}, of which neither the memory nor {place} have as much; expected less; set "
+            f"needs {limits.gigabytes(size)}, more than is free in memory or in {place}; expected less; set "
             "TMPDIR to a larger disk, or read a part with --crop or means over voxels with --downsample"
         )
     with TemporaryFile(prefix="illumgrid-") as file:
         if hasattr(os, "posix_fallocate"):
-            os.posix_fallocate(file.fileno(), 0, size)  # a disk that fills up later would end the process
+            os.posix_fallocate(file.fileno(), 0, size)  # otherwise a disk that fills up later would end the process
         else:
             file.truncate(size)
         return np.asarray(np.memmap(file, dtype, "r+", shape=tuple(shape), order=order))
 
 
 def mapped(stream: IO[bytes], dtype: DTypeLike, count: int) -> NDArray[Any] | None:
-    """The next numbers of a raw file, (count,), read-only, which the system reads when they are looked at.
+    """The next numbers of a raw file, (count,), read-only, which the system reads on access.
 
-    None where that is not possible, or where they fit into memory: a file that others change meanwhile is then read
-    once. The stream is behind them.
+    None if that is not possible, or if they fit into memory: they are then read once, in case others change the file.
+    The stream is behind them afterwards.
     """
     kind = np.dtype(dtype)
     plain = isinstance(stream, io.BufferedReader) and isinstance(stream.raw, io.FileIO)
@@ -70,9 +70,9 @@ def mapped(stream: IO[bytes], dtype: DTypeLike, count: int) -> NDArray[Any] | No
 
 
 def settled(values: NDArray[Any]) -> NDArray[Any]:
-    """The same values in C order and in the byte order of this machine; a large array is turned a part at a time.
+    """The same values in C order and in the byte order of this machine; a large array is transposed in parts.
 
-    What fits into memory stays as it is: others turn it.
+    An array that fits into memory is returned unchanged: callers transpose it.
     """
     native = values.dtype.newbyteorder("=")
     if (values.flags.c_contiguous and values.dtype.isnative) or values.nbytes <= limits.free_memory() // SHARE:

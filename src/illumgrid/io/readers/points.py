@@ -28,7 +28,7 @@ _UNPACKED = 4  # bytes in memory for a byte of text: the text and its numbers
 
 @dataclass(frozen=True, eq=False)
 class Cloud:
-    """Points (n, 3), their weights (n,), and what the file says of a periodic cell and the unit of length."""
+    """Points (n, 3), their weights (n,), and the periodic cell and unit of length of the file."""
 
     points: Floats
     weights: Floats | None = None
@@ -89,7 +89,7 @@ def _reader(source: Source) -> Reader:
     if source.ending in (".pdb", ".ent", ".cif", ".mmcif"):
         return _read_structure
     if b"\0" in source.head:
-        raise BadInput(f"holds bytes that are no text; {EXPECTED}; save it as one of those")
+        raise BadInput(f"holds bytes that are not text; {EXPECTED}; save it as one of those")
     return _read_table
 
 
@@ -225,7 +225,7 @@ def _gemmi() -> Any:
         import gemmi
     except ImportError:
         raise BadInput(
-            "is read by the package gemmi, which is not installed; expected it beside illumgrid; run "
+            "is read by the package gemmi, which is not installed; expected it to be installed; run "
             "pip install 'illumgrid[atoms]'"
         ) from None
     return gemmi

@@ -35,7 +35,7 @@ from illumgrid.io.readers.scene_keys import (
 )
 
 LIMIT = 1 << 20
-"""Bytes that a scene file may have: it holds words, the voxels are elsewhere."""
+"""Most bytes of a scene file: it contains words; voxels are elsewhere."""
 
 LONGEST_LINE = 2000
 """Characters. The time that tomllib takes for a key grows with the square of its dots."""
@@ -82,7 +82,7 @@ def read_scene(path: str | os.PathLike[str], *, smoothing: float = 0.0) -> Scene
 
 @contextmanager
 def _place(words: str) -> Iterator[None]:
-    """Say where the trouble is, before what it is."""
+    """Prefix a message with the place of the problem."""
     try:
         yield
     except BadInput as problem:
@@ -118,11 +118,11 @@ def _tables(content: bytes) -> Table:
         raise
     except ValueError as problem:  # of tomllib, or of a number with thousands of digits
         reason = " ".join(str(problem).split()).replace(". ", ", ")[:200]
-        raise BadInput(f"not TOML ({reason}); {EXPECTED}; mend it there") from None
+        raise BadInput(f"not TOML ({reason}); {EXPECTED}; correct it there") from None
 
 
 def _listed(tables: Table, kind: str, keys: Mapping[str, Take], required: tuple[str, ...]) -> list[tuple[str, Table]]:
-    """The tables [[kind]], check_table, each with the words that say where it is: number and name."""
+    """The tables [[kind]], checked, each with words for its place: number and name."""
     found = tables.get(kind, [])
     if not (isinstance(found, list) and all(isinstance(table, dict) for table in found)):
         came = f"the single table [{kind}]" if isinstance(found, dict) else f"{kind} = {shown(found)}"
@@ -212,14 +212,14 @@ def _without(table: Table, keys: Mapping[str, Any]) -> Table:
 
 
 def _with_material(table: Table) -> Table:
-    """The table with `material` in place of `albedo` and `emission`; None for a signed field that says neither."""
+    """The table with `material` in place of `albedo` and `emission`; None for a signed field that gives neither."""
     keys = {**MATERIAL, **LOOKS}
     given = {key: table[key] for key in keys if key in table}
     return {**_without(table, keys), "material": None if table.get("signed") and not given else Material(**given)}
 
 
 def _volume(table: Table, folder: Path, smoothing: float, read: dict[str, Volume]) -> Volume:
-    """Volume of a field, smoothed; `read` keeps what other fields have read."""
+    """Volume of a field, smoothed; `read` keeps what was read for other fields."""
     from illumgrid.io.points import density_of_file
     from illumgrid.io.readers import read_volume
 

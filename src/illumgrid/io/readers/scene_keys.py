@@ -1,4 +1,4 @@
-"""The keys of a scene file: what each takes, and the sentence for a value or a key that is wrong."""
+"""The keys of a scene file: accepted values, and the message for a wrong value or key."""
 
 import difflib
 from collections.abc import Callable, Mapping
@@ -8,11 +8,11 @@ from illumgrid.errors import BadInput
 
 Table = dict[str, Any]
 Take = Callable[[str, Any], Any]
-"""From a key and what a file says there to what a dataclass takes; bounds of its own are left to the dataclass."""
+"""From a key and its value in the file to an argument of a dataclass, which checks further bounds itself."""
 
 
 def shown(value: Any) -> str:
-    """What came, on one line that is not long."""
+    """The given value, on one line of limited length."""
     text = repr(value)
     return text if len(text) <= 80 else f"{text[:60]}… ({len(text)} characters)"
 
@@ -36,10 +36,10 @@ def _yes(key: str, value: Any) -> bool:
 
 
 def _numbers(count: int, expected: str, kind: type[int] | type[float] = float, most: float = 1e30) -> Take:
-    """Takes a list of `count` numbers (whole ones if `kind` is int) that are finite and not beyond `most`."""
+    """Accepts a list of `count` finite numbers (whole ones if `kind` is int), none beyond `most`."""
 
     def good(x: Any) -> bool:
-        # In Python true is a whole number; NaN is not at most anything.
+        # In Python True is a whole number; comparisons with NaN are false.
         return not isinstance(x, bool) and isinstance(x, (int, kind)) and -most <= x <= most
 
     def take(key: str, value: Any) -> list[Any]:
@@ -183,7 +183,7 @@ def unknown(kind: str, name: str, known: Mapping[str, Any]) -> BadInput:
 
 
 def check_table(table: Table, keys: Mapping[str, Take], required: tuple[str, ...]) -> Table:
-    """What the table says, after the check that it has the required keys, no others than `keys`, and good values."""
+    """The content of a table, after the check of required keys, unknown keys and values."""
     for key in table:
         if key not in keys:
             raise unknown("key", key, keys)

@@ -11,7 +11,7 @@ from illumgrid.errors import BadInput, tell
 from illumgrid.field.lights import MOST_PIXELS
 
 NEGATIVE = 0.01
-"""Negative light of an image, of its positive light, that is taken as 0: lossy compression leaves some beside lamps."""
+"""Largest ratio of negative to positive light of an image for which it becomes 0: lossy compression leaves some."""
 EXPECTED = "expected an image of the sky, .exr or .hdr, twice as wide as high"
 
 
@@ -36,12 +36,12 @@ def read_image(path: str | os.PathLike[str]) -> NDArray[np.float32]:
     except Exception as reason:  # the EXR library raises RuntimeError, ValueError...
         raise BadInput(f"{file.name} cannot be read ({type(reason).__name__}: {reason}); {EXPECTED}") from None
     if not np.isfinite(image).all():
-        raise BadInput(f"{file.name} has pixels that are no numbers; expected radiance from 0 up")
+        raise BadInput(f"{file.name} has pixels that are not numbers; expected radiance from 0 up")
     return _without_negatives(file.name, image)
 
 
 def _without_negatives(name: str, image: NDArray[np.float32]) -> NDArray[np.float32]:
-    """The image with 0 for what is negative."""
+    """The image with 0 in place of negative values."""
     where = (image < 0).any(axis=2)
     if not (count := int(where.sum())):
         return image

@@ -1,4 +1,4 @@
-"""Bytes of files: opened safely, unpacked as a stream, every byte counted and every checksum verified."""
+"""Bytes of files: opened safely, unpacked as a stream, with every byte counted and every checksum verified."""
 
 import bz2
 import gzip
@@ -30,7 +30,7 @@ Packing = Literal["raw", "gzip", "zlib", "bzip2"]
 
 @dataclass(frozen=True)
 class Source:
-    """A regular file, perhaps gzipped as a whole."""
+    """A regular file, possibly gzipped as a whole."""
 
     file: Path
     size: int
@@ -56,13 +56,13 @@ class Source:
         return self.size * DEFLATE if self.packed else self.size
 
     def most_inside(self, packing: Packing) -> int:
-        """Bytes that a part of this packing can have at most, unpacked; packing what is packed gains nothing."""
+        """Largest number of bytes to which a part can unpack; packing packed data gains nothing."""
         return self.most if packing == "raw" else self.size * (1 << 16 if packing == "bzip2" else DEFLATE)
 
 
 def open_regular(file: Path) -> IO[bytes]:
     """Open a file for reading; anything but a regular file (a pipe, a device, a socket) is refused without waiting."""
-    # A pipe without a writer would wait for ever in open.
+    # Opening a pipe without a writer would block.
     number = os.open(file, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
     if not stat.S_ISREG(os.fstat(number).st_mode):
         os.close(number)
@@ -71,7 +71,7 @@ def open_regular(file: Path) -> IO[bytes]:
 
 
 def find_source(file: Path, whole: bool = True) -> Source:
-    """Look at the beginning of a file; where it is gzipped as a `whole`, of what it unpacks to."""
+    """Examine the beginning of a file; if it is gzipped as a `whole`, of the unpacked data."""
     with open_regular(file) as stream:
         size = os.fstat(stream.fileno()).st_size
         head = stream.read(HEAD)
@@ -95,7 +95,7 @@ def opened(source: Source) -> Iterator[IO[bytes]]:
 
 @contextmanager
 def seekable(source: Source) -> Iterator[IO[bytes]]:
-    """The file, unpacked, for libraries that seek: a gzipped one is unpacked into memory."""
+    """The file, unpacked, for libraries that seek; a gzipped file is unpacked into memory."""
     if not source.packed:
         with open_regular(source.file) as stream:
             yield stream
@@ -103,20 +103,20 @@ def seekable(source: Source) -> Iterator[IO[bytes]]:
     whole = io.BytesIO()
     with opened(source) as stream:
         while chunk := stream.read(CHUNK):
-            check_memory(2 * len(chunk) + whole.tell())  # a buffer that grows is copied
+            check_memory(2 * len(chunk) + whole.tell())  # so that no growing buffer is copied
             whole.write(chunk)
     whole.seek(0)
     yield whole
 
 
 def beside(source: Source, named: str, follow: bool = False) -> Source:
-    """A file that a header names, in the folder of the header or below it; elsewhere only if `follow` allows.
+    """A file that a header names, in the folder of the header or below it; elsewhere only with `follow`.
 
     It is taken as it is: whether it is packed the header says.
     """
     folder = source.file.parent
     if not named or "\0" in named:
-        raise BadInput(f"its header names the data file {named!r}; expected a file beside it; mend the header")
+        raise BadInput(f"its header names the data file {named!r}; expected a file beside it; correct the header")
     place = folder / named
     outside = Path(named).is_absolute() or ".." in Path(named).parts or "\\" in named or ":" in named[:2]
     if outside and not follow:
@@ -179,7 +179,7 @@ class _Zlib(io.RawIOBase):
 def read_array(
     stream: IO[bytes], dtype: DTypeLike, shape: Sequence[int], order: Literal["C", "F"] = "F"
 ) -> NDArray[Any]:
-    """The next prod(shape) numbers of a stream, or a refusal where it ends before; call `check_size` first.
+    """The next prod(shape) numbers of a stream, or a refusal if it ends before; call `check_size` first.
 
     What is larger than a quarter of the free memory is paged: see `illumgrid.io.readers.paged`.
     """
@@ -197,7 +197,7 @@ def read_array(
 
 
 def skip(stream: IO[bytes], count: int) -> None:
-    """Pass over bytes: in a file by seeking, elsewhere by reading, which unpacks and verifies them."""
+    """Skip bytes: in a file by seeking, otherwise by reading, which unpacks and verifies them."""
     if isinstance(stream, io.BufferedReader) and isinstance(stream.raw, io.FileIO):
         stream.seek(max(count, 0), os.SEEK_CUR)
         return
@@ -221,7 +221,7 @@ def read_text(stream: IO[bytes], count: int) -> tuple[NDArray[np.float64], bytes
             words = np.array(found, dtype=float)
         except ValueError as problem:
             raise BadInput(
-                f"holds what is no number ({str(problem)[-60:]}); expected {count} numbers; mend it"
+                f"holds something that is not a number ({str(problem)[-60:]}); expected {count} numbers; correct it"
             ) from None
         flat[done : done + len(words)] = words
         done += len(words)
@@ -231,9 +231,9 @@ def read_text(stream: IO[bytes], count: int) -> tuple[NDArray[np.float64], bytes
 
 
 def finish(stream: IO[bytes], spare: int = CHUNK, behind: bytes | None = None) -> int:
-    """Read what follows the data, so that the checksum at the end is verified; how many bytes that were (padding: 0).
+    """Read what follows the data, so that the checksum at the end is verified; returns its bytes (padding: 0).
 
-    More than `spare` bytes are refused: the header does not say what they are. Of text, `behind` was read already.
+    More than `spare` bytes are refused, since the header does not describe them. For text, `behind` was already read.
     """
     more = stream.read(spare + 1)
     if len(more) > spare:

@@ -1,4 +1,4 @@
-"""What a reader hands over: values as they are stored, where they lie, and what the user should know about them."""
+"""The result of a reader: values as stored, their placement, and notes for the user."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -23,7 +23,7 @@ Note = tuple[str, str]
 
 @dataclass(frozen=True)
 class Wanted:
-    """What the user chooses of a file that holds several volumes."""
+    """The user's choices for a file that holds several volumes."""
 
     channel: Choice = None
     time: Choice = None
@@ -33,10 +33,10 @@ class Wanted:
     follow: bool = False
     """Read data files outside the folder of the header that names them."""
     most: int | None = None
-    """Of an image in several resolutions, which none is chosen of, the finest of at most so many voxels is read."""
+    """Of an image in several resolutions, without a choice, the finest with at most so many voxels is read."""
 
     def spans(self, shape: Sequence[int]) -> list[Span]:
-        """What is kept of the axes x, y and z of a volume; refused where that cannot be."""
+        """The selection along x, y and z of a volume; refused if it is not possible."""
         box = [edge for n in shape for edge in (0, n)] if self.crop is None else list(self.crop)
         first, last = np.array(box[::2]), np.array(box[1::2])
         if len(box) != 6 or (first < 0).any() or (last > shape).any() or (last - first < 2).any():
@@ -78,10 +78,10 @@ class Stored:
 
 
 def following(count: int) -> tuple[Note, ...]:
-    """What to say of bytes behind the data."""
+    """A note about bytes behind the data."""
     if not count:
         return ()
-    return (("file", f"{count} bytes follow its data, of which its header says nothing; they are left out"),)
+    return (("file", f"{count} bytes follow its data, of which its header says nothing; they are ignored"),)
 
 
 def pick(chosen: Choice, option: str, names: Sequence[str]) -> int:
@@ -111,7 +111,7 @@ def pick(chosen: Choice, option: str, names: Sequence[str]) -> int:
 
 
 def part(stored: Stored, wanted: Wanted) -> Stored:
-    """The voxels that are wanted; what does not fill a block of means at the upper ends is left out."""
+    """The selected voxels; incomplete blocks at the upper ends are left out."""
     spans = wanted.spans(stored.whole or stored.values.shape)
     values = take(stored.values, spans) if stored.whole is None else stored.values
     first, factor = np.array([span.first + (span.block - 1) / 2 for span in spans]), spans[0].block
@@ -129,7 +129,7 @@ def part(stored: Stored, wanted: Wanted) -> Stored:
 
 
 def with_spacing(stored: Stored, spacing: Sequence[float]) -> Stored:
-    """The same with other distances between voxels, and without the warnings about those of the file."""
+    """The same with another spacing, and without the notes about that of the file."""
     step = np.array(spacing, float)
     if step.shape != (3,) or not np.isfinite(step).all() or not (step > 0).all():
         raise BadInput(f"--spacing is {' '.join(map(str, np.ravel(spacing)))}; expected three positive numbers: X Y Z")
@@ -140,21 +140,25 @@ def with_spacing(stored: Stored, spacing: Sequence[float]) -> Stored:
 
 
 SKEW = 0.005
-"""Cosine of the angle between axes that is still taken for a right one (0.3°): rounding in a header."""
+"""Largest cosine of the angle between axes that counts as a right angle (0.3°): rounding in a header."""
 
 
 def place(stored: Stored) -> tuple[Volume, tuple[Note, ...]]:
-    """The volume, resampled onto right angles where the axes of the file are oblique to each other; and its notes."""
+    """The volume, resampled onto right angles if the axes of the file are oblique to each other; and its notes."""
     check_axes(stored.values.shape)
     if not (np.isfinite(stored.steps).all() and np.isfinite(stored.origin).all()):
-        raise BadInput("its spacing or orientation is not finite; expected numbers; mend its header or give --spacing")
+        raise BadInput(
+            "its spacing or orientation is not finite; expected numbers; correct its header or give --spacing"
+        )
     spacing = np.linalg.norm(stored.steps, axis=0)
     if not (spacing > 0).all():
         raise BadInput(
             f"its spacing is {spacing.tolist()}; expected three positive numbers; give it with --spacing X Y Z"
         )
     if abs(np.linalg.det(stored.steps / spacing)) < 1e-3:
-        raise BadInput(f"its axes are {stored.steps.T.tolist()}; expected three different directions; mend its header")
+        raise BadInput(
+            f"its axes are {stored.steps.T.tolist()}; expected three different directions; correct its header"
+        )
     if stored.spacing is not None and np.allclose(stored.spacing, spacing, rtol=1e-5, atol=0):
         spacing = stored.spacing
     direction = stored.steps / spacing
@@ -188,7 +192,7 @@ _SHEARED = (
 
 
 MOST_EMPTY = 64
-"""Times its voxels that the box around a sheared volume may have."""
+"""Largest number of voxels of the box around a sheared volume, relative to the volume's."""
 
 
 def unsheared(stored: Stored) -> Stored:

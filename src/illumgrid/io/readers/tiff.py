@@ -50,7 +50,7 @@ def read(source: Source, wanted: Wanted) -> Stored:
 
 
 def _part(series: Any, spans: Sequence[Span]) -> NDArray[Any]:
-    """What is wanted of a series, page by page, where each page is a plane of it."""
+    """The selection from a series, page by page, where each page is one of its planes."""
     plane = series.keyframe.shape
     outer = series.ndim - len(plane)
     paged = outer > 0 and series.shape[outer:] == plane and len(series.pages) == math.prod(series.shape[:outer])
@@ -113,7 +113,7 @@ def _parts(name: str) -> list[str]:
 
 
 def _gaps(files: Sequence[Path]) -> tuple[Note, ...]:
-    """What the last numbers in the names say of missing slices."""
+    """A note about missing slices, by the last numbers in the names."""
     numbers = [int(found[-1]) for file in files if (found := re.findall(r"\d+", file.stem))]
     if len(numbers) != len(files) or len(set(numbers)) < len(numbers):
         return ()
@@ -174,7 +174,7 @@ def _refuse_damaged(reports: list[str]) -> None:
 
 
 def _serious(reports: list[str]) -> tuple[Note, ...]:
-    """What of tifffile's reports a user should know."""
+    """Reports of tifffile that a user should see."""
     serious = [text for text in reports if re.search(r"corrupt|invalid|missing|truncated|fail|raised", text)]
     return (("file", f"tifffile reports: {plain(serious[0])}"),) if serious else ()
 
@@ -182,7 +182,7 @@ def _serious(reports: list[str]) -> tuple[Note, ...]:
 def _series(tiff: Any, wanted: Wanted) -> int:
     """Number of the series that is the volume; thumbnails and the coarse levels of a pyramid do not count."""
     if not tiff.series:
-        raise BadInput("a TIFF without images; expected slices; look how it was written")
+        raise BadInput("a TIFF without images; expected slices; check how it was written")
     full = [n for n, s in enumerate(tiff.series) if not s.keyframe.is_reduced] or list(range(len(tiff.series)))
     whole = [tiff.series[n] for n in full]
     if tiff.is_imagej and whole[0].kind != "imagej":
@@ -248,7 +248,7 @@ def _three_axes(
         # Pages without a meaning, or else what their writer called time steps, are slices.
         stack = next((axis for axis in "IQRT" if axis in axes), "")
         if stack == "T" and wanted.time is None:
-            notes = (("file", "its slices are called time steps; they were taken for slices along z"),)
+            notes = (("file", "its slices are called time steps; they were read as slices along z"),)
         if stack and not (stack == "T" and wanted.time is not None):
             axes = axes.replace(stack, "Z", 1)
     if "S" in axes and "C" not in axes:

@@ -1,4 +1,4 @@
-"""How far the voxels of a TIFF are from each other: by OME, LSM, ImageJ, MetaMorph, or its resolution tags."""
+"""The spacing of a TIFF: by OME, LSM, ImageJ, MetaMorph, or its resolution tags."""
 
 import math
 import re
@@ -46,14 +46,14 @@ def calibrated(tiff: Any, series: int) -> Found:
             return _by_resolution(tiff, x, y)
         found, unit, notes = _checked([x or 1.0, y or 1.0, abs(depth)], unit)
         if not (x and y):
-            text = "does not say how large its pixels are; 1 was taken, as ImageJ does; give --spacing"
+            text = "does not state the size of its pixels; 1 was assumed, as ImageJ does; give --spacing"
             notes = (*notes, ("spacing", text))
         return found, unit, notes
     return _by_resolution(tiff, x, y)
 
 
 def channel_names(tiff: Any, series: int) -> Sequence[str]:
-    """What OME or LSM call the channels; empty where they do not."""
+    """Names of the channels by OME or LSM; empty if there are none."""
     pixels = _ome_pixels(tiff, series)
     if pixels:
         found = pixels.get("Channel", [])
@@ -84,9 +84,7 @@ def _by_ome(pixels: dict[str, Any]) -> Found:
         unit = _unit(pixels.get(f"PhysicalSize{axis}Unit", "µm"))
         sizes.append(size * scale.get(unit or "", math.nan))
     if not any(math.isfinite(size) for size in sizes):
-        text = (
-            "its OME description does not say how far its voxels are from each other; 1, 1, 1 was taken; give --spacing"
-        )
+        text = "its OME description does not state the distance between its voxels; 1, 1, 1 was assumed; give --spacing"
         return np.ones(3), None, (("spacing", text),)
     return _checked(sizes, "µm")
 
@@ -99,7 +97,7 @@ def _checked(sizes: Sequence[float], unit: str | None) -> Found:
         return found, unit, ()
     known = found[good][0] if good.any() else 1.0
     lacking = " and ".join(axis for axis, fine in zip("xyz", good) if not fine)
-    text = f"does not say how far its voxels are from each other along {lacking}; {known:g} was taken; give --spacing"
+    text = f"does not state the distance between its voxels along {lacking}; {known:g} was assumed; give --spacing"
     return np.where(good, found, known), unit, (("spacing", text),)
 
 
@@ -110,12 +108,12 @@ def _by_resolution(tiff: Any, x: float, y: float) -> Found:
     dpi = 25.4 / width if width else 0.0
     if not (math.isfinite(width) and width > 0 and height > 0) or (width == height and round(dpi) in PRINTING):
         said = f", only {dpi:.4g} dots per inch, as for printing" if dpi and math.isfinite(dpi) else ""
-        text = f"does not say how far its voxels are from each other{said}; 1, 1, 1 was taken; give --spacing"
+        text = f"does not state the distance between its voxels{said}; 1, 1, 1 was assumed; give --spacing"
         return np.ones(3), None, (("spacing", text),)
     depth = width if math.isclose(width, height, rel_tol=1e-6) else 1.0
     text = (
-        f"its resolution says {width:.4g} x {height:.4g} mm for a pixel, but nothing how far slices are from each "
-        f"other; {depth:.4g} mm was taken; give --spacing"
+        f"its resolution says {width:.4g} x {height:.4g} mm for a pixel, but not the distance between slices; "
+        f"{depth:.4g} mm was assumed; give --spacing"
     )
     return np.array([width, height, depth]), "mm", (("spacing", text),)
 

@@ -37,7 +37,7 @@ MOST_LZMA = 8000
 
 @dataclass
 class _Image:
-    """What the XML says."""
+    """The content of the XML."""
 
     attributes: dict[str, str]
     """Of VTKFile and ImageData."""
@@ -52,7 +52,7 @@ class _Piece:
 
 @dataclass(frozen=True)
 class _Data:
-    """How the numbers of an array are written: inline text, or an offset into what is appended."""
+    """How the numbers of an array are written: inline text, or an offset into the appended data."""
 
     form: str
     offset: int | None
@@ -154,7 +154,9 @@ def _placement(attributes: dict[str, str]) -> tuple[tuple[int, ...], Floats, Flo
         except ValueError:
             found = np.full(count, np.nan)
         if found.shape != (count,) or not np.isfinite(found).all():
-            raise BadInput(f"its {key} is {attributes.get(key, '')[:60]!r}; expected {count} finite numbers; mend it")
+            raise BadInput(
+                f"its {key} is {attributes.get(key, '')[:60]!r}; expected {count} finite numbers; correct it"
+            )
         return found
 
     extent = _whole(attributes.get("WholeExtent", ""), 6, "WholeExtent")
@@ -216,7 +218,9 @@ def _numbers(attributes: dict[str, str], array: Array, count: int, appended: "_B
         try:
             flat = np.array("".join(data.inline).split(), dtype=array.dtype if array.dtype.kind in "iu" else float)
         except (ValueError, OverflowError):
-            raise BadInput(f"its array {array.name!r} cannot be read: it holds what is no number; {AGAIN}") from None
+            raise BadInput(
+                f"its array {array.name!r} cannot be read: it holds something that is not a number; {AGAIN}"
+            ) from None
         if len(flat) != count:
             raise BadInput(f"its array {array.name!r} cannot be read: it has {len(flat)} of {count} values; {AGAIN}")
         return flat.astype(array.dtype)
@@ -317,7 +321,7 @@ def _block(packed: bytes, length: int, compressor: str) -> bytes:
             import lz4.block
         except ImportError:
             raise BadInput(
-                "is packed by LZ4, which needs the package lz4; expected it beside illumgrid: pip install "
+                "is packed by LZ4, which needs the package lz4; expected it to be installed: pip install "
                 "illumgrid[lz4]; or save the volume with another compressor"
             ) from None
         return bytes(lz4.block.decompress(packed, uncompressed_size=length))

@@ -100,14 +100,14 @@ def _parse(text: "_Text") -> tuple[tuple[int, ...], Floats, Floats, list[Array]]
     if len(shape) != 3 or min(shape) < 1:
         raise BadInput(f"its dimensions are {' '.join(map(str, shape)) or 'missing'}; {OTHER}")
     if not (np.isfinite(spacing).all() and (spacing > 0).all()):
-        raise BadInput(f"its spacing is {spacing.tolist()}; expected three positive numbers; mend its header")
+        raise BadInput(f"its spacing is {spacing.tolist()}; expected three positive numbers; correct its header")
     return shape, origin, np.diag(spacing), arrays
 
 
 def _attribute(
     text: "_Text", key: str, words: list[str], cells: bool, count: int, before: list[Array]
 ) -> Iterator[Array]:
-    """An array named by a keyword, behind which the text goes on."""
+    """An array named by a keyword, behind which the text continues."""
     name = unquote(words[1]) if len(words) > 1 else ""
     if key == "SCALARS":
         kind, components = _type(_some(words, 3)[2]), _int(words[3]) if len(words) > 3 else 1
@@ -178,7 +178,7 @@ def _float(word: str) -> float:
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        raise BadInput(f"has {word[:40]!r} for its origin or spacing; expected finite numbers; mend its header")
+        raise BadInput(f"has {word[:40]!r} for its origin or spacing; expected finite numbers; correct its header")
     return value
 
 
@@ -191,7 +191,7 @@ def _type(word: str) -> np.dtype[Any]:
 
 
 class _Text:
-    """Where one is in the file."""
+    """The position in the file."""
 
     def __init__(self, content: Any) -> None:
         self.content, self.at, self.binary = content, 0, False
@@ -214,13 +214,13 @@ class _Text:
         return []
 
     def skip_line(self, key: str) -> None:
-        """Pass over the next line if it begins with `key`."""
+        """Skip the next line if it begins with `key`."""
         start = self.at
         if not self.line().strip().upper().startswith(key):
             self.at = start
 
     def skip(self, kind: np.dtype[Any], count: int) -> int:
-        """Pass over `count` numbers; where they begin."""
+        """Skip `count` numbers; returns their position."""
         start = self.at
         if self.binary:
             length = (count + 7) // 8 if kind.kind == "b" else count * kind.itemsize
@@ -233,7 +233,7 @@ class _Text:
         return start
 
     def skip_strings(self, count: int) -> None:
-        """Pass over texts: lines, or bytes behind their number."""
+        """Skip texts: lines, or bytes behind their number."""
         for _ in range(count):
             if self.at >= len(self.content):
                 raise BadInput(f"ends within an array of texts; {AGAIN}")
@@ -272,7 +272,7 @@ class _Text:
             if len(chunk) == CHUNK:
                 space = re.search(rb"\s\S*\Z", chunk)
                 if space is None:
-                    raise BadInput(f"holds what is no number; {AGAIN}")
+                    raise BadInput(f"holds something that is not a number; {AGAIN}")
                 chunk = chunk[: space.start() + 1]
             words = chunk.split()
             if not words:
@@ -287,4 +287,6 @@ class _Text:
             try:
                 yield np.array(words, dtype=float)
             except ValueError:
-                raise BadInput(f"ends after too few of {count} values, or holds what is no number; {AGAIN}") from None
+                raise BadInput(
+                    f"ends after too few of {count} values, or holds something that is not a number; {AGAIN}"
+                ) from None

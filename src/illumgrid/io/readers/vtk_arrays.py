@@ -15,19 +15,19 @@ from illumgrid.io.readers.stored import Choice, Note, Wanted, pick
 
 @dataclass(frozen=True)
 class Array:
-    """What a header says of one array."""
+    """An array as described by a header."""
 
     name: str
     cells: bool
-    """On cells, not on points."""
+    """On cells instead of points."""
     components: int
     dtype: np.dtype[Any]
     active: bool
     """Marked as the scalars."""
     place: Any = None
-    """Where its numbers are, for the reader of the format."""
+    """Position of its numbers, for the reader of the format."""
     scale: float = 1.0
-    """Of numbers that are text."""
+    """Whether its numbers are text."""
 
     @property
     def where(self) -> str:
@@ -41,7 +41,7 @@ class Array:
 
 
 def the_field(arrays: Sequence[Array], wanted: Wanted) -> tuple[Array, int, list[Note]]:
-    """The array that is wanted, which of its components, and what to say about the others."""
+    """The wanted array, the number of its component, and a note about the others."""
     found = [array for array in arrays if not array.name.startswith("vtk")]  # ghosts, masks and numbers of points
     listed = ", ".join(array.shown for array in found)[:400] or "none"
     if wanted.array is not None:

@@ -1,6 +1,6 @@
-"""Parts of arrays, taken while a file is read: a box of voxels, and means over blocks of them.
+"""Parts of arrays, selected during reading: a box of voxels, and means over blocks of them.
 
-What is left out is passed over in the file, or unpacked and dropped; in memory is the part, and a slab of the file.
+The rest is skipped in the file, or unpacked and dropped; memory holds only the part, and a slab of the file.
 """
 
 import math
@@ -15,12 +15,12 @@ from illumgrid.io.readers.paged import resident
 from illumgrid.io.readers.source import read_array, skip
 
 SLAB = 1 << 16
-"""Numbers that are read at once, at least."""
+"""Least number of values that are read at once."""
 
 
 @dataclass(frozen=True)
 class Span:
-    """What is kept along one axis: `first` up to (not with) `last`, as means over `block` at a time."""
+    """The selection along one axis: `first` up to, not including, `last`, in means over `block` at a time."""
 
     first: int
     last: int
@@ -28,12 +28,12 @@ class Span:
 
     @property
     def count(self) -> int:
-        """How many are left."""
+        """Number of values that remain."""
         return (self.last - self.first) // self.block
 
 
 def single(number: int) -> Span:
-    """One of many."""
+    """A single index."""
     return Span(number, number + 1)
 
 
@@ -47,14 +47,14 @@ def need(dtype: DTypeLike, shape: Sequence[int], spans: Sequence[Span]) -> int:
 
 
 def take(values: NDArray[Any], spans: Sequence[Span]) -> NDArray[Any]:
-    """The part of an array."""
+    """The selected part of an array."""
     if all(span.block == 1 for span in spans):
         return values[tuple(slice(span.first, span.last) for span in spans)]
     return means(sums(values, spans), spans, values.dtype)
 
 
 def sums(values: NDArray[Any], spans: Sequence[Span]) -> NDArray[np.float64]:
-    """The part of an array, summed over its blocks."""
+    """The selected part of an array, summed over its blocks."""
     part = values[tuple(slice(span.first, span.first + span.count * span.block) for span in spans)]
     total = np.zeros([span.count for span in spans])
     for offset in np.ndindex(*(span.block for span in spans)):
@@ -63,7 +63,7 @@ def sums(values: NDArray[Any], spans: Sequence[Span]) -> NDArray[np.float64]:
 
 
 def means(total: NDArray[np.float64], spans: Sequence[Span], dtype: np.dtype[Any]) -> NDArray[Any]:
-    """Sums over blocks as means of values of a type, in single precision unless that is double."""
+    """Means from sums over blocks, for values of a type: in single precision unless the type is double."""
     total /= math.prod(span.block for span in spans)
     return total if dtype.kind == "f" and dtype.itemsize == 8 else total.astype(np.float32)
 
@@ -71,7 +71,7 @@ def means(total: NDArray[np.float64], spans: Sequence[Span], dtype: np.dtype[Any
 def read_part(
     stream: IO[bytes], dtype: DTypeLike, shape: Sequence[int], spans: Sequence[Span], order: Literal["C", "F"] = "F"
 ) -> NDArray[Any]:
-    """A part of the array that comes next in a stream, which is then behind the whole array.
+    """The selected part of the next array in a stream, which is then behind the whole array.
 
     Call `check_size` first, with the memory that `need` says.
     """
@@ -100,7 +100,7 @@ def read_part(
 
 
 def _wanted(shape: Sequence[int], spans: Sequence[Span]) -> list[int]:
-    """Numbers of the slabs that are kept, in the order of the file."""
+    """Numbers of the selected slabs, in the order of the file."""
     marks = [
         (np.arange(n) >= span.first) & (np.arange(n) < span.first + span.count * span.block)
         for n, span in zip(shape, spans)
@@ -112,7 +112,7 @@ def _wanted(shape: Sequence[int], spans: Sequence[Span]) -> list[int]:
 
 
 def join(plane: Callable[[int], NDArray[Any]], span: Span) -> NDArray[Any]:
-    """Stack the planes, by number, that are kept along the last axis."""
+    """Stack the selected planes, by number, along the last axis."""
     out: NDArray[Any] | None = None
     for number in range(span.first, span.first + span.count * span.block):
         one = plane(number)

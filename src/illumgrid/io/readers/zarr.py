@@ -27,11 +27,11 @@ from illumgrid.io.readers.stored import Note, Stored, Wanted, pick
 from illumgrid.io.readers.windows import Span
 
 _MOST = 1000
-"""Members of a group that are looked at."""
+"""Largest number of members of a group that are examined."""
 _DEEP = 3
-"""Groups within groups that are looked into."""
+"""Depth of groups within groups that are examined."""
 _SAFE = {"bytes", "zstd", "gzip", "zlib", "crc32c", "transpose", "sharding_indexed"}
-"""Codecs that fuzzing does not make crash; arrays with others, such as blosc, are decoded in a process of their own."""
+"""Codecs that fuzzing did not crash; arrays with others, such as blosc, are decoded in a process of their own."""
 
 
 def read_folder(folder: Path, wanted: Wanted) -> Stored:
@@ -49,7 +49,7 @@ def read_folder(folder: Path, wanted: Wanted) -> Stored:
 
 
 def _image(group: Any) -> Mapping[str, Any] | None:
-    """What a group says of an image in several resolutions."""
+    """The image in several resolutions that a group describes."""
     about = group.attrs.asdict()
     several = about.get("ome", about).get("multiscales") if isinstance(about.get("ome", about), dict) else None
     return several[0] if isinstance(several, list) and several and isinstance(several[0], dict) else None
@@ -89,7 +89,7 @@ def _read_image(group: Any, wanted: Wanted) -> Stored:
     for level in levels:
         if len(names) != len(group[level].shape):
             raise BadInput(
-                f"its axes are {', '.join(names)}, its array has {len(group[level].shape)}; mend its metadata"
+                f"its axes are {', '.join(names)}, its array has {len(group[level].shape)}; correct its metadata"
             )
     number = _level(group, levels, order, wanted)
     array = group[levels[number]]
@@ -107,7 +107,7 @@ def _read_image(group: Any, wanted: Wanted) -> Stored:
         notes = (("choice", f"holds one image in {len(levels)} resolutions ({', '.join(sizes)}): {which} was "
                   "read; --array N (array=N) reads another"),)  # fmt: skip
     elif not _spaced(about, number):
-        notes = (("spacing", "its metadata do not say the distance between voxels: 1 is taken; give --spacing"),)
+        notes = (("spacing", "its metadata do not state the distance between voxels: 1 is assumed; give --spacing"),)
     chosen = by_name(names, array.shape, wanted)
     return _box(array, order, chosen, wanted, steps[order], origin[order], unit, notes)
 
@@ -138,7 +138,7 @@ def _transformed(steps: Floats, origin: Floats, changes: Any) -> tuple[Floats, F
         if numbers is None or numbers.shape != steps.shape or not np.isfinite(numbers).all():
             raise BadInput(
                 f"its change of coordinates {str(change)[:80]} came; expected a scale or translation of "
-                f"{len(steps)} numbers; mend its metadata"
+                f"{len(steps)} numbers; correct its metadata"
             )
         steps, origin = (steps * numbers, origin * numbers) if kind == "scale" else (steps, origin + numbers)
     return steps, origin
@@ -156,12 +156,12 @@ def _read_array(array: Any, wanted: Wanted) -> Stored:
     else:
         order, spans = three_axes(array.shape, wanted)
         chosen = {axis: span.first for axis, span in enumerate(spans) if axis not in order}
-    note = ("spacing", "its metadata do not say the distance between voxels: 1 is taken; give --spacing")
+    note = ("spacing", "its metadata do not state the distance between voxels: 1 is assumed; give --spacing")
     return _box(array, order, chosen, wanted, np.ones(3), np.zeros(3), None, (note,))
 
 
 def _safe(array: Any) -> bool:
-    """Whether the array's codecs check what they read."""
+    """Whether the array's codecs validate what they read."""
     about = array.metadata.to_dict()
     codecs = json.dumps([about.get(key) for key in ("codecs", "compressor", "filters")], default=str)
     return set(re.findall(r'"(?:name|id)": "([^"]*)"', codecs)) <= _SAFE

@@ -1,4 +1,4 @@
-"""What draws: OpenGL where there is one, else the package's own kernels."""
+"""Rendering engines: OpenGL where it is available, otherwise the package's own kernels."""
 
 from typing import TYPE_CHECKING
 
@@ -11,16 +11,16 @@ if TYPE_CHECKING:
 ENGINES = ("auto", "egl", "osmesa", "software")
 
 
-_LARGE = 1 << 26  # voxels; extraction holds each in single precision, and millions of triangles
+_LARGE = 1 << 26  # voxels; extraction holds each in single precision, and makes millions of triangles
 
 
 def too_large_for_meshes(scene: "Scene") -> bool:
-    """Whether rays draw a scene in much less memory than triangles."""
+    """Whether drawing a scene by rays takes much less memory than by triangles."""
     return sum(field.volume.stored.size for field in scene.fields) > _LARGE
 
 
 def choose_engine(name: str) -> tuple[str, str]:
-    """Engine that draws when `name` is asked for, and why.
+    """The engine for a requested name, and the reason for the choice.
 
     Raises
     ------

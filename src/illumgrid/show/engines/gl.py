@@ -28,12 +28,12 @@ PACKAGES = {"egl": "libegl1 libgl1", "osmesa": "libosmesa6"}
 """Platforms, best first, and the Debian packages that bring their libraries."""
 
 _opened: dict[str, Any] = {}  # at most one: platform to renderer
-_home: list[tuple[int, int]] = []  # process and thread whose context it is: in another, drawing fails or hangs
-_missing: dict[str, str] = {}  # platform to why it cannot be used here
+_home: list[tuple[int, int]] = []  # process and thread that own the context: in another, drawing fails or hangs
+_missing: dict[str, str] = {}  # platform to the reason why it cannot be used here
 
 
 def unavailable(platform: str) -> str | None:
-    """Why this platform cannot draw in this process and thread, in some words; None if it can."""
+    """Why this platform cannot draw in this process and thread, in a few words; None if it can."""
     if reason := elsewhere():
         return reason
     if platform not in _opened and platform not in _missing:
@@ -44,7 +44,7 @@ def unavailable(platform: str) -> str | None:
 
 
 def elsewhere() -> str | None:
-    """Where OpenGL was opened, if that is not in this thread of this process."""
+    """Where OpenGL was opened, if not in this thread of this process."""
     if not (_opened and _home) or _home == [(os.getpid(), threading.get_ident())]:
         return None
     where = "thread" if _home[0][0] == os.getpid() else "process, from which this one was forked"
@@ -62,7 +62,7 @@ def _open(platform: str) -> str | None:
     try:
         pyrender = _import(platform)
         renderer = pyrender.OffscreenRenderer(64, 64)
-        renderer._platform.supports_framebuffers = lambda: True  # else OSMesa keeps the size of the first picture
+        renderer._platform.supports_framebuffers = lambda: True  # otherwise OSMesa keeps the size of the first picture
         _opened[platform] = pyrender, renderer
         _home[:] = [(os.getpid(), threading.get_ident())]
     except Exception as error:  # ImportError, AttributeError, EGLError, AssertionError...
@@ -78,7 +78,7 @@ def _open(platform: str) -> str | None:
 
 
 def _forget() -> None:
-    """Let the other platform be tried after this one failed."""
+    """Allow the other platform to be tried after this one failed."""
     gc.collect()
     for name in [n for n in sys.modules if n.split(".")[0] in ("OpenGL", "pyrender")]:
         del sys.modules[name]
@@ -89,7 +89,7 @@ def _import(platform: str) -> Any:
         warnings.simplefilter("ignore")
         if not hasattr(np, "infty"):
             setattr(np, "infty", np.inf)  # noqa: B010  (gone since NumPy 2)
-        # pyrender imports its window, pyglet with it, and with that the libraries of a desktop: none of it is needed.
+        # pyrender imports its window, with it pyglet, and with that desktop libraries: none of them is needed.
         window: Any = types.ModuleType("pyrender.viewer")
         window.Viewer = None
         sys.modules[window.__name__] = window
@@ -103,7 +103,7 @@ def _import(platform: str) -> Any:
 
 
 def _complete_osmesa() -> None:
-    """Give PyOpenGL 3.1.0 what pyrender wants of it: contexts of a chosen version, and ones that can be compared."""
+    """Add to PyOpenGL 3.1.0 what pyrender needs: contexts of a chosen version, and contexts that can be compared."""
     import ctypes
 
     import OpenGL.platform
@@ -148,7 +148,7 @@ def draw(
 
 
 def _scene(pyrender: Any, parts: list[Colored], camera: Camera, background: Colors) -> tuple[Any, float, float]:
-    """What pyrender draws, in the camera's axes and divided by the far distance, and the distances it lies between."""
+    """The scene for pyrender, in the camera's axes and divided by the far distance; its near and far distances."""
     scene = pyrender.Scene(bg_color=[*map(float, srgb_curve(background[:3])), float(background[3])])
     axes = np.stack([camera.right, camera.up, -camera.forward], axis=1)
     parts = [part for part in parts if len(part.faces)]
@@ -178,7 +178,7 @@ def _linear(drawn: NDArray[np.uint8]) -> Colors:
 
 
 def _depths(placed: list[Floats]) -> tuple[float, float]:
-    """Distances of the near and the far plane that hold all points in front of the camera."""
+    """Distances of the near and the far plane that contain all points in front of the camera."""
     depth = np.concatenate([-p[:, 2] for p in placed]) if placed else np.ones(1)
     far = float(depth.max())
     if far <= 0:

@@ -1,4 +1,4 @@
-"""Pictures without OpenGL: the level sets are marched by the package's own kernels, four rays per pixel."""
+"""Pictures without OpenGL: the package's own kernels march the level sets, with four rays per pixel."""
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -18,7 +18,7 @@ from illumgrid.show.shade import Coat, Colors, Shown, opaque
 from illumgrid.tone import encode_rgba
 
 SIDE = 2  # sub-samples along each side of a pixel
-COAT_RAYS = 4  # from each sub-sample that shows a coat, in pictures by lookups
+COAT_RAYS = 4  # rays per sub-sample that shows a coat, in pictures by lookups
 _ROWS = 8  # picture rows that are traced together: bounds the memory
 
 
@@ -49,7 +49,7 @@ def traced(seen: Callable[[Floats], Colors], camera: Camera, width: int, height:
 
 @dataclass(frozen=True, eq=False)
 class Hits:
-    """What rays from the eye meet first.
+    """The first surfaces that rays from the eye meet.
 
     Parameters
     ----------
@@ -72,7 +72,7 @@ class Hits:
     what: NDArray[np.int64]
 
     def lit(self, number: int) -> NDArray[np.int64]:
-        """Rows of the rays that meet a surface with light of its own: no cap, no cut."""
+        """Rows of the rays that meet a surface with light of its own: neither a cap nor a cut."""
         return np.flatnonzero((self.number == number) & (self.what != CAP) & (self.what != CUT))
 
 
@@ -100,7 +100,7 @@ def place_on(shown: Shown, quad: int, points: Floats) -> tuple[Floats, Floats]:
 def colors_of(
     shown: Shown, hits: Hits, background: Colors, light: Colors | None = None, coat: Coat | None = None
 ) -> Colors:
-    """Colours (n, 4) of what is met, lit by lookups, or by irradiance `light` (n, 3), perhaps under coats."""
+    """Colours (n, 4) of the surfaces, lit by lookups or by irradiance `light` (n, 3), optionally under coats."""
     color = np.tile(background, (len(hits.what), 1))
     for k in range(len(shown.scene.fields)):
         caps = np.flatnonzero((hits.number == k) & (hits.what == CAP))
@@ -146,7 +146,7 @@ def draw(shown: Shown, camera: Camera, width: int, height: int, background: Colo
 
     def coat(layer: Layer, directions: Floats) -> Coat:
         rows = coated(shown, layer)
-        numbers = np.ascontiguousarray(directions).view(np.uint64)  # an identity that no strip changes
+        numbers = np.ascontiguousarray(directions).view(np.uint64)  # an identity that does not depend on the strip
         ids = numbers[rows, 0] ^ numbers[rows, 1] << np.uint64(7) ^ numbers[rows, 2] << np.uint64(13)
         found = arriving(shown, camera.eye, layer, rows, ids, range(COAT_RAYS), 0, False)
         return Coat.over(layer.hits.facing, rows, found / np.float32(COAT_RAYS))

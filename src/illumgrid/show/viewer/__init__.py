@@ -34,7 +34,7 @@ MODULES = (
     "resting",
     "live",
     "view",
-)  # each imports from earlier
+)  # each file imports only from earlier ones
 SHADERS = (
     "shared.glsl", "ray.vert", "march.glsl", "field.frag", "wall.vert", "wall.frag", "copy.frag", "mix.frag",
     "origin.frag", "origin_wall.frag", "gather.glsl", "gather_sky.frag", "gather.frag", "gather_wall.frag",
@@ -49,9 +49,9 @@ def source(name: str) -> str:
 
 
 def script(last: str, live: bool = False) -> str:
-    """The modules and `last` joined into one: names are unique, so imports and exports are dropped, as comments are.
+    """The modules and `last` joined into one script: names are unique, so imports, exports and comments are dropped.
 
-    What deals with light that is still to come is in `live` pages only.
+    Code for light that is still being computed is in `live` pages only.
     """
     names = [name for name in MODULES if live or name not in ("coarse", "live")]
     joined = "\n".join(source(f"{name}.js") for name in (*names, last))
@@ -74,7 +74,7 @@ def _json(value: Any) -> str:
 
 
 def policy(text: str, live: bool = False) -> str:
-    """What the page may do: run this one script, show pictures that it drew; no network, no frames, no forms.
+    """The content security policy of the page: this one script, pictures that it drew; no network, frames or forms.
 
     A page that is `live` may also ask the server that it came from.
     """
@@ -85,7 +85,7 @@ def policy(text: str, live: bool = False) -> str:
 
 
 def page(light: Illumination, up: str | None = None, tint: "Tint | None" = None, coming: "Coming | None" = None) -> str:
-    """One HTML file that holds everything: it opens from disk and makes no network request.
+    """One HTML file that contains everything: it opens from disk and makes no network request.
 
     Parameters
     ----------
@@ -95,7 +95,7 @@ def page(light: Illumination, up: str | None = None, tint: "Tint | None" = None,
     tint : Tint, optional
         A second quantity that colours all fields.
     coming : Coming, optional
-        The light is coarse, and the page, which is made quickly, asks the server that it came from for the rest.
+        For light that is still coarse: the page then requests the rest from the server that it came from.
 
     Returns
     -------

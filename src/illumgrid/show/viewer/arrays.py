@@ -13,10 +13,10 @@ from illumgrid.grid import GridSpec, IlluminationGrid
 from illumgrid.grid.channels import Channels, mixed
 
 MOST_SIDE = 2048
-"""Voxels along one side of a texture: what graphics drivers of phones and laptops take."""
-HOLE = -1.0  # in place of an error: no light of its own, or no error known
+"""Voxels along one side of a texture: what graphics drivers of phones and laptops accept."""
+HOLE = -1.0  # in place of an error: no light of its own, or unknown error
 _STEPS = 65535
-_FINE = 4096  # steps that the swept range must span: else values far outside it are clamped
+_FINE = 4096  # steps that the swept range must span; otherwise values far outside it are clamped
 
 
 class Bytes:
@@ -53,7 +53,7 @@ def reduced(volume: Volume, most: int) -> Volume:
 
 
 def thinned(grid: IlluminationGrid, most: int) -> IlluminationGrid:
-    """Light on fewer nodes, at most about `most`, from the first node to the last: what the grid answers there.
+    """Light resampled on at most about `most` nodes, from the first node to the last.
 
     Error and support are those of the nearest node.
     """
@@ -98,7 +98,7 @@ def _whole(values: NDArray[Any]) -> bool:
 
 
 def _planes(words: NDArray[np.uint16]) -> bytes:
-    """All low bytes, then all high bytes: similar bytes lie together and compress better."""
+    """All low bytes, then all high bytes: similar bytes are then adjacent and compress better."""
     return (words & 0xFF).astype(np.uint8).tobytes() + (words >> 8).astype(np.uint8).tobytes()
 
 
@@ -115,17 +115,17 @@ def half_planes(values: NDArray[np.floating]) -> bytes:
 def pack_values(steps: NDArray[Any], into: Bytes) -> dict[str, Any]:
     """Field values (nx, ny, nz) as differences along x."""
     x_fastest = np.ascontiguousarray(steps.transpose(2, 1, 0))
-    x_fastest[:, :, 1:] -= x_fastest[:, :, :-1].copy()  # wraps around; adding up undoes it
+    x_fastest[:, :, 1:] -= x_fastest[:, :, :-1].copy()  # wraps around; summation undoes it
     data = x_fastest.tobytes() if steps.dtype == np.uint8 else _planes(x_fastest.ravel())
     return {"shape": list(steps.shape), "bytes": steps.dtype.itemsize, "offset": into.add(data)}
 
 
 def pack_light(light: NDArray[np.floating], error: NDArray[np.floating], into: Bytes) -> dict[str, Any]:
     """Light (nx, ny, nz, C), grey or RGB, and its error (nx, ny, nz) as half floats, x fastest."""
-    # A channel at a time, and halved before it is turned: half the bytes to move, and no array of all channels.
+    # Channel by channel, and converted to half floats before the transposition: half the bytes to move.
     half = [_half(channel).T.ravel() for channel in (*np.moveaxis(light, 3, 0), error)]
     for channel in half[1:-1]:
-        channel -= half[0]  # channels are similar: the differences compress well
+        channel -= half[0]  # channels are similar, so their differences compress well
     data = b"".join(_planes(channel) for channel in half)
     return {"shape": list(light.shape[:3]), "channels": light.shape[3], "offset": into.add(data)}
 
@@ -135,12 +135,12 @@ def pack_layers(
 ) -> list[dict[str, Any]]:
     """The channels of light (nx, ny, nz, C) that hold one of several lights, as half floats, x fastest.
 
-    Each with the number of its light, and what it adds to the `colors` colours (1 or 3) where that light weighs 1.
+    Each with the number of its light, and its contribution to the `colors` colours (1 or 3) at weight 1.
     """
     names, packed = [layer.name for layer in layers], []
     for name, row, values in zip(channels.names, mixed(channels, layers, {}).mix, np.moveaxis(light, -1, 0)):
         if layer := name.rpartition(".")[0]:
-            peak = max(row)  # half floats reach as far as the picture needs, however bright a light is
+            peak = max(row)  # half floats have enough range for the picture, however bright a light is
             data = half_planes(values.T * peak)
             color = [share / peak for share in row[:colors]]
             packed.append({"light": names.index(layer), "color": color, "offset": into.add(data)})

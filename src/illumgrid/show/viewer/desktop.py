@@ -49,7 +49,7 @@ class Window:
         )  # fmt: skip
 
     def _look(self, isovalue: float, aspect: float, up: str | None = None) -> None:
-        """The camera of the still picture, which turns about the middle of what it shows."""
+        """The camera of the still picture, which rotates about the middle of the scene."""
         scene = self.light.scene
         row = scene.levels_through(0, isovalue)[0]
         seen, outline = fit_camera(scene, row, aspect, up=up), outline_of(scene, row)
@@ -61,14 +61,14 @@ class Window:
         camera.view_angle = float(np.degrees(2 * np.arctan(seen.tangent)))
 
     def sweep(self, isovalue: float) -> None:
-        """Extract the isosurfaces at this setting of the sweep, look their light up, and show them."""
+        """Extract the isosurfaces at this setting of the sweep, look up their light, and show them."""
         scene = self.light.scene
         row = scene.levels_through(0, isovalue)[0]
         shown = Shown(self.light, row, float(np.clip(scene.fields[0].place(isovalue), 0.0, 1.0)), False)
         eye = np.asarray(self.plotter.camera.position, float)
         solids = [piece for k, field in enumerate(scene.fields) for piece in solid(shown, k, field, eye)]
         walls = [wall(shown, k, eye) for k in range(len(scene.quads))]
-        for number in range(2 * len(scene.fields) + len(walls)):  # pieces that this isovalue lacks
+        for number in range(2 * len(scene.fields) + len(walls)):  # components without a surface at this isovalue
             self.plotter.remove_actor(f"piece {number}", reset_camera=False, render=False)
         for number, piece in enumerate(solids + walls):
             if not len(piece.faces):
@@ -77,7 +77,7 @@ class Window:
             mesh["rgb"] = encode_srgb(piece.colors)
             self.plotter.add_mesh(
                 mesh, scalars="rgb", rgb=True, lighting=False, name=f"piece {number}", reset_camera=False, render=False,
-                culling="back" if number >= len(solids) else None,  # walls are seen from their front only
+                culling="back" if number >= len(solids) else None,  # walls are seen from the front only
             )  # fmt: skip
         self.plotter.reset_camera_clipping_range()
         self.plotter.render()

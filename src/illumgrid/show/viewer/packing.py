@@ -1,4 +1,4 @@
-"""From an `Illumination` to what the page draws: a description in JSON, and its arrays as one run of bytes.
+"""From an `Illumination` to the data of the page: a description in JSON, and its arrays as one run of bytes.
 
 Everything is placed on a *stage*: world axes, the scene's box of size about 1 around its middle, so that single
 precision is enough for a graphics card wherever the data lie.
@@ -50,7 +50,7 @@ _BINS = 96
 
 @dataclass(frozen=True)
 class Stage:
-    """Stage coordinates s stand for world points middle + size s."""
+    """Stage coordinates s of world points: world = middle + size · s."""
 
     middle: Floats
     size: float
@@ -76,7 +76,7 @@ class Stage:
 
 
 def _histogram(field: Field) -> dict[str, Any]:
-    """Voxels over the swept range and a third of its span on either side, as far as there are data."""
+    """Histogram of the voxels over the swept range and a third of its span on either side, as far as there are data."""
     (least, most), (low, high) = field.volume.stored_extremes, field.stored_range
     margin = (high - low) / 3
     low = min(low, max(float(least), low - margin))
@@ -86,7 +86,7 @@ def _histogram(field: Field) -> dict[str, Any]:
 
 
 def kept_apart(light: Illumination) -> dict[str, float]:
-    """Weights of the lights by name, if grids and walls keep several lights that can be weighed anew, else none."""
+    """Weights of the lights by name, if grids and walls store several lights separately; else none."""
     held = [*(grid.channels for grid in light.grids), *(wall.channels for wall in light.walls)]
     apart = all(channels.mixable and "." in channels.names[-1] for channels in held)
     return {name: float(light.weights.get(name, 1.0)) for name in light.lights} if apart else {}
@@ -137,7 +137,7 @@ def _field(
         "range": field.range.tolist(),
         "sweep": field.sweep.tolist(),
         "upward": sign,
-        "albedo": shown_albedo.tolist(),  # of what is not seen through
+        "albedo": shown_albedo.tolist(),  # of fields that are not translucent
         "through": through,
         "rough": material.roughness,
         "window": [(sign * float(x) - base) / step for x in field.volume.to_stored(cuts.window(field))],
@@ -153,7 +153,7 @@ def _field(
 
 
 def _caps(light: Illumination, number: int) -> dict[str, Any]:
-    """Exposed light of the faces of a field's box, -1 where it is not known, and what each light or sky adds to it."""
+    """Exposed light of the faces of a field's box, -1 if unknown, and the contribution of each light or sky."""
     scale, sky, apart = light.exposure / np.pi, skies.sky_of(light), kept_apart(light)
     found, channels = channels_on_caps(light, number)
     shown = np.nan_to_num(light_on_caps(light, number) * np.float32(scale), nan=-1.0)
@@ -177,12 +177,12 @@ def _note_reduced(
 
 
 def _mix(channels: Channels, light: NDArray[np.float32]) -> NDArray[np.float32]:
-    """What is shown of light (..., C), clamped only after interpolation, as `IlluminationGrid.lookup` does."""
+    """The shown mix of light (..., C), clamped only after interpolation, as in `IlluminationGrid.lookup`."""
     return channels.shown(light) if channels.own else np.asarray(light @ np.array(channels.mix, np.float32))
 
 
 def _usual(light: Illumination, held: IlluminationGrid | WallTexture) -> list[float]:
-    """Exposed mean light of what has light of its own; where lights are kept apart, of each at weight 1."""
+    """Exposed mean light of nodes with light of their own; for lights stored separately, of each at weight 1."""
     apart, lit = kept_apart(light), held.light[held.support > 0]
     mixes = [{name: float(name == one) for name in apart} for one in apart]
     shown = [mixed(held.channels, layers_of(light.scene), weights) for weights in mixes] or [held.channels]
@@ -203,7 +203,7 @@ def _css(linear: Floats) -> str:
 
 
 def _beside(walls: list[NDArray[np.float32]]) -> NDArray[np.float32]:
-    """Textures (K, nv, nu, C) of walls side by side in one (u, v, sweep, C)."""
+    """Textures (K, nv, nu, C) of walls, joined side by side into one (u, v, sweep, C)."""
     high = max(wall.shape[1] for wall in walls)
     padded = [np.pad(wall, [(0, 0), (0, high - wall.shape[1]), (0, 0), (0, 0)]) for wall in walls]
     return np.concatenate(padded, axis=2).transpose(2, 1, 0, 3)
@@ -249,7 +249,7 @@ def _walls(light: Illumination, stage: Stage, into: Bytes) -> tuple[list[dict[st
 
 
 def opening(scene: Scene, up: str | None = None) -> dict[str, Any]:
-    """The view of the still picture at the middle of the sweep, and the hull that it must hold."""
+    """The view of the still picture at the middle of the sweep, and the hull that it must contain."""
     from scipy.spatial import ConvexHull, QhullError
 
     stage = Stage.of(scene)
@@ -259,7 +259,7 @@ def opening(scene: Scene, up: str | None = None) -> dict[str, Any]:
     points = stage.place(outline_of(scene, row))
     try:
         points = points[ConvexHull(points).vertices]
-    except (QhullError, ValueError):  # flat, or too few: its box is a hull too
+    except (QhullError, ValueError):  # flat, or too few points: its box is a hull, too
         points = np.array(list(np.ndindex(2, 2, 2))) * np.ptp(points, axis=0) + points.min(axis=0)
     return {
         "azimuth": float(np.arctan2(-forward @ right, -forward @ front)),
@@ -269,7 +269,7 @@ def opening(scene: Scene, up: str | None = None) -> dict[str, Any]:
 
 
 def _between(colors: Floats, steps: int = 13) -> Floats:
-    """Colours (steps, 3), evenly between those given: a style sheet mixes in sRGB, the shader in linear light."""
+    """Colours (steps, 3), evenly between given ones: a style sheet interpolates in sRGB, the shader in linear light."""
     at = np.linspace(0, len(colors) - 1, steps)
     return np.stack([np.interp(at, np.arange(len(colors)), channel) for channel in colors.T], axis=1)
 

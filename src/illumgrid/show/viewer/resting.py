@@ -1,4 +1,4 @@
-"""What the page needs of the lights to gather light by rays of its own, while nothing moves."""
+"""The lights for the page, with which it gathers light by its own rays at rest."""
 
 from typing import Any
 
@@ -14,15 +14,14 @@ from illumgrid.show.viewer.arrays import Bytes, half_planes
 
 MOST_SURFACES = 16
 FINEST = 256, 512
-"""Rows and columns of an image of the sky that a page holds."""
-_PEAK = 6e4  # of what half floats hold
+"""Rows and columns of an image of the sky in a page."""
+_PEAK = 6e4  # largest half float
 
 
 def described(light: Illumination, names: list[str], into: Bytes) -> dict[str, Any] | None:
-    """Lights as the exposure shows them, each with its number among the page's sliders `names`, -1 if it has none.
+    """Exposed lights, each with its number among the page's sliders `names`, -1 if it has none.
 
-    None where the page would need more than it holds: beside fields that shine, and with more surfaces than
-    `MOST_SURFACES`.
+    None if the page cannot gather light: for fields that emit, and for more surfaces than `MOST_SURFACES`.
     """
     scene = light.scene
     materials = [field.material for field in scene.fields]
@@ -59,13 +58,13 @@ def described(light: Illumination, names: list[str], into: Bytes) -> dict[str, A
 
 
 def _size(images: list[Floats]) -> tuple[int, int]:
-    """Rows and columns of the finest of some images, `FINEST` at most."""
+    """Rows and columns of the finest of some images, at most `FINEST`."""
     rows, columns = np.max([image.shape[:2] for image in images] or [(0, 0)], axis=0)
     return min(int(rows), FINEST[0]), min(int(columns), FINEST[1])
 
 
 def smaller(image: Floats, rows: int, columns: int) -> NDArray[np.float64]:
-    """An image of the sky (h, w, 3) in so many rows and columns: the mean light of what each pixel covers."""
+    """An image of the sky (h, w, 3) with so many rows and columns: the mean light over each pixel."""
     h, w, _ = image.shape
     image = resampled(image, max(h, rows), max(w, columns))
     h, w, _ = image.shape
@@ -75,6 +74,6 @@ def smaller(image: Floats, rows: int, columns: int) -> NDArray[np.float64]:
 
 
 def _shares(few: Floats, many: Floats) -> Floats:
-    """Which share of each part of a line, between these ends, each of finer parts covers: one row for each."""
+    """Share of each part of a line, between these ends, that each of some finer parts covers: one row for each."""
     common = np.minimum(few[1:, None], many[1:]) - np.maximum(few[:-1, None], many[:-1])
     return np.asarray(np.maximum(common, 0.0) / np.diff(few)[:, None])

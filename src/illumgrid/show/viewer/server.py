@@ -1,4 +1,4 @@
-"""Serve the page to this machine only, and only to requests that carry its token; and news of light, if it is live."""
+"""Serve the page to this machine only, to requests that carry its token; for a live page, also new light."""
 
 import secrets
 import socket
@@ -11,18 +11,18 @@ from typing import Any
 from urllib.parse import parse_qs
 
 CONNECTIONS = 32
-"""At once; more are hung up on, so that descriptors and threads do not run out."""
+"""Connections at once; more are closed, so that descriptors and threads do not run out."""
 
 CHUNK = 1 << 16
-"""Bytes that a slow reader has `_Answer.timeout` seconds for."""
+"""Bytes that a slow reader may take `_Answer.timeout` seconds for."""
 
 News = Callable[[dict[str, list[str]]], bytes]
-"""Answers what a live page asks, by the names in the address."""
+"""Answers requests of a live page, by the names in the address."""
 
 HEADERS = {
     "Content-Type": "text/html; charset=utf-8",
     "Cache-Control": "no-store",
-    # Beside the page's own policy: what only a header can say.
+    # In addition to the page's own policy: directives that only a header can give.
     "Content-Security-Policy": "frame-ancestors 'none'; sandbox allow-scripts allow-same-origin allow-downloads",
     "Cross-Origin-Resource-Policy": "same-origin",
     "Referrer-Policy": "no-referrer",
@@ -31,7 +31,7 @@ HEADERS = {
 
 
 class PageServer(ThreadingHTTPServer):
-    """One page at 127.0.0.1, on a free port, under a token drawn at each start; beneath it `news` at "light"."""
+    """One page at 127.0.0.1, on a free port, under a new token at each start; below it `news` at "light"."""
 
     daemon_threads = True
 
@@ -43,11 +43,11 @@ class PageServer(ThreadingHTTPServer):
 
     @property
     def address(self) -> str:
-        """Where a browser finds the page."""
+        """The address of the page for a browser."""
         return f"http://127.0.0.1:{self.server_address[1]}{self.place}"
 
     def process_request(self, request: Any, client_address: Any) -> None:
-        """Answer in a thread of its own, if not too many are at work."""
+        """Answer in a thread of its own, unless too many are running."""
         if self.free.acquire(blocking=False):
             super().process_request(request, client_address)
         else:
@@ -61,7 +61,7 @@ class PageServer(ThreadingHTTPServer):
             self.free.release()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Ignore a browser that hangs up; report anything else as usual."""
+        """Ignore a browser that closes the connection; report anything else as usual."""
         if not isinstance(sys.exception(), ConnectionError | TimeoutError):
             super().handle_error(request, client_address)
 

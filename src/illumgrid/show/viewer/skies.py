@@ -1,4 +1,4 @@
-"""Light under any smooth sky, for the page: the answers to all basis functions, or the principal components that fit.
+"""Light under any smooth sky, for the page: the answers to all basis functions, or principal components that fit.
 
 P.-P. Sloan, J. Hall, J. Hart and J. Snyder, "Clustered principal components for precomputed radiance transfer",
 SIGGRAPH 2003, with one cluster.
@@ -20,16 +20,16 @@ from illumgrid.light import Illumination
 from illumgrid.show.viewer.arrays import Bytes, half_planes
 
 MOST_BYTES = 18_000_000
-"""Of the answers in one page, before compression: a grey field of 128³ voxels and a grid of 96³ nodes then stay under
-25 MB, whatever they hold."""
+"""Bytes of the answers in one page, before compression: a grey field of 128³ voxels and a grid of 96³ nodes then stay
+under 25 MB, whatever they hold."""
 FEWEST = 12
-"""Components for which a grid is thinned if they do not fit."""
+"""Number of components that must fit; otherwise the grid is thinned."""
 FINE = 4
-"""The first components are half floats, the others, which are weaker, whole steps of 8 bits."""
+"""The first components are half floats, the others, which are weaker, integers of 8 bits."""
 
 
 def sky_of(light: Illumination) -> Harmonics | None:
-    """The sky of a run that keeps the answers to its basis functions."""
+    """The sky of a run that stores the answers to its basis functions."""
     held = [*(grid.channels for grid in light.grids), *(wall.channels for wall in light.walls)]
     skies = [one for one in light.scene.lights if isinstance(one, Harmonics)]
     first = f"{skies[0].name}.0" if skies else ""
@@ -37,7 +37,7 @@ def sky_of(light: Illumination) -> Harmonics | None:
 
 
 def described(light: Illumination) -> dict[str, Any] | None:
-    """The sky as the page needs it: coefficients by basis function and colour, and the axes right, back and up."""
+    """The sky for the page: coefficients by basis function and colour, and the axes right, back and up."""
     sky = sky_of(light)
     if sky is None:
         return None
@@ -51,14 +51,14 @@ def described(light: Illumination) -> dict[str, Any] | None:
 
 @dataclass(frozen=True, eq=False)
 class Answers:
-    """What each basis function of a sky brings to nodes.
+    """The contribution of each basis function of a sky to nodes.
 
     Parameters
     ----------
     light : (n, colors, B) float32
         One colour if no surface has any, else three.
     rest : (n, 3) float32
-        Light of what is no sky, as it is shown.
+        Light of all sources other than the sky, in the shown mix.
     """
 
     light: NDArray[np.float32]
@@ -66,7 +66,7 @@ class Answers:
 
 
 def answers(light: Illumination, sky: Harmonics, stored: NDArray[np.float32], channels: Channels) -> Answers:
-    """From light (..., C) as a grid or a wall of a run stores it."""
+    """The answers from light (..., C) as a grid or a wall of a run stores it."""
     stored, count = stored.reshape(-1, len(channels)), len(sky.coefficients)
     colors = [c for c in "YRGB" if f"{sky.name}.0.{c}" in channels.names]
     each = [[channels.names.index(f"{sky.name}.{b}.{c}") for b in range(count)] for c in colors]
@@ -76,10 +76,10 @@ def answers(light: Illumination, sky: Harmonics, stored: NDArray[np.float32], ch
 
 
 def components(light: NDArray[np.float32], most: int) -> tuple[NDArray[np.float32], Floats, float]:
-    """The answers (n, colors, B) by at most `most` components: values (n, colors, K), basis (K, B), and what is lost.
+    """At most `most` components of the answers (n, colors, B): values (n, colors, K), basis (K, B), and the error.
 
-    Values times basis are the answers, all of them if K = B. Else what is lost is their relative root mean square, over
-    nodes and over skies whose coefficients are independent and equally large.
+    Values times basis are the answers, exactly if K = B. Otherwise the error is the relative root mean square of the
+    rest, over nodes and over skies whose coefficients are independent and equally large.
     """
     count = light.shape[-1]
     if most >= count:
@@ -116,7 +116,7 @@ def pack_sky(held: Answers, most: int, into: Bytes) -> tuple[list[dict[str, Any]
 
 
 def room(light: Illumination) -> float:
-    """Bytes that a page has for each value of a component: of each node that is lit, and texel, and colour."""
+    """Bytes that a page has for each value of a component: per lit node or texel, and colour."""
     lit = sum(len(reachable(field, grid.spec)) for field, grid in zip(light.scene.fields, light.grids))
     texels = sum(wall.light[..., 0].size for wall in light.walls)
     colors = 1 if any(name.endswith(".Y") for name in light.grids[0].channels.names) else 3
@@ -124,5 +124,5 @@ def room(light: Illumination) -> float:
 
 
 def fitting(bytes_: float, sky: Harmonics) -> int:
-    """How many components so many bytes for each value hold."""
+    """Number of components that fit into so many bytes per value."""
     return int(np.clip(bytes_ - FINE, FEWEST, len(sky.coefficients)))

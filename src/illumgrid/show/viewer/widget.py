@@ -26,7 +26,7 @@ def _widget_class() -> type[Any]:
         ) from reason
 
     class View(anywidget.AnyWidget):  # type: ignore[misc, unused-ignore]
-        """A lit scene; `isovalue`, of the first field, and `weights`, by light, follow the sliders and set them."""
+        """A lit scene; the traits `isovalue` (of the first field) and `weights` (by light) follow the sliders."""
 
         _esm = script("widget", live=True)
         isovalue = traitlets.Float().tag(sync=True)
@@ -69,7 +69,7 @@ def widget(
 ) -> Any:
     """A widget that shows `light`; see `Illumination.show`.
 
-    Where light is `coming`, its views ask for it by messages: `news` answers what is in the address of a page.
+    If light is still `coming`, its views request it by messages, which `news` answers like requests of a page.
     """
     view = _widget_class()
     from illumgrid.show.viewer.packing import kept_apart
@@ -94,7 +94,7 @@ def widget(
 
 
 def follow(made: Any, light: Illumination, up: str | None = None) -> None:
-    """Let views that are opened from now on show all light; those that are open have asked for it."""
+    """Use the complete light for views that are opened from now on; open ones have requested it."""
     from illumgrid.show.viewer.packing import kept_apart
 
     with made.hold_sync():
@@ -112,7 +112,7 @@ def _described(light: Illumination, up: str | None, tint: Tint | None, coming: C
 
 
 def _answer(news: Callable[[str], bytes], made: Any, asked: Any, buffers: Any) -> None:
-    """Send what is new to the view that asks; without a buffer where there is no light any more."""
+    """Send new light to the view that asks; without a buffer if the light is gone."""
     try:
         found = [news(str(asked["question"]))]
     except Exception as problem:
