@@ -202,7 +202,7 @@ def test_elements_of_xyz_have_masses(tmp_path):
         ("a.xyz", "water\n\nO 1 2 3\n", ["number of atoms"]),
         ("a.pdb", "hello\n", ["no atoms"]),
         ("a.cif", "hello\n", ["not understood"]),
-        ("a.bin", "\0\1", ["no text"]),
+        ("a.bin", "\0\1", ["not text"]),
         ("a.npy", b"\x93NUMPY", ["a.npy"]),
     ],
 )

@@ -180,7 +180,7 @@ def test_a_missing_slice_is_interpolated_and_said(tmp_path):
     check(volume, linear)
     check(read(enhanced(tmp_path / "b.dcm", [6, 0, 2, 3, 5], [linear] * 5), "2 of its 7 slices are missing"), linear)
     series(tmp_path / "c", np.concatenate([linear] * 3, axis=2), ks=[0, 1, 2, 18, 19, 20])
-    refused(tmp_path / "c", "there is nothing", "on one side")
+    refused(tmp_path / "c", "there is a gap", "on one side")
 
 
 def test_uneven_slices_are_interpolated_onto_even_ones(tmp_path):
@@ -333,7 +333,7 @@ def test_dose(tmp_path):
 def test_a_film_and_colours_are_named(tmp_path):
     refused(WHOLE / "examples_ybr_color.dcm", "film")
     refused(WHOLE / "SC_rgb_rle_2frame.dcm", "colours", "--channel")
-    red = read(WHOLE / "SC_rgb_rle_2frame.dcm", "does not say where", channel=0)
+    red = read(WHOLE / "SC_rgb_rle_2frame.dcm", "does not state the position", channel=0)
     there = pydicom.dcmread(WHOLE / "SC_rgb_rle_2frame.dcm").pixel_array
     assert np.array_equal(red.values, there[..., 0].T)
 
