@@ -126,7 +126,9 @@ def test_the_whole_is_never_in_memory(tmp_path, monkeypatch, kind):
         assert read_volume(file).stored[7, 8, 9] == 200
     monkeypatch.setattr(paged.shutil, "disk_usage", lambda place: SimpleNamespace(free=100_000_000))
     if kind != "npy":
-        with pytest.raises(BadInput, match=r"needs [\d.]+ GB, more than is free in memory or in .* TMPDIR .* --downsample"):
+        with pytest.raises(
+            BadInput, match=r"needs [\d.]+ GB, more than is free in memory or .* TMPDIR .* --downsample"
+        ):
             read_volume(file)
     part = read_volume(file, crop=(4, 12, 4, 12, 4, 12))
     assert part.values[3, 4, 5] == 200 and np.count_nonzero(part.values) == 1
