@@ -211,6 +211,15 @@ def test_channels_of_any_name_and_mix_come_back(tmp_path):
         assert one.channels == key and np.array_equal(one.light, other.light)
 
 
+def test_a_volume_in_place_of_a_run_is_named_as_what_it_is(tmp_path):
+    np.save(tmp_path / "v.npy", np.eye(3))
+    for ask in (store.read, store.describe):
+        with pytest.raises(
+            BadInput, match=r"v\.npy is a file; expected the folder of a run; light it by 'illumgrid run "
+        ):
+            ask(tmp_path / "v.npy")
+
+
 def test_a_run_of_format_1_still_loads():
     """Written by the version before channels had names, of a small ball on a wall."""
     folder = Path(__file__).with_name("format_1")

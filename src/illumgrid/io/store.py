@@ -152,6 +152,8 @@ def read(folder: str | os.PathLike[str]) -> Stored:
     place = Path(folder)
     if not place.exists():
         disk.sweep(Path(os.path.abspath(place)))  # an older run that a killed writer had moved aside
+    if place.is_file():
+        raise BadInput(f"{place} is a file; expected the folder of a run; light it by 'illumgrid run {place}' first")
     for name in (EXR, RUN):
         if not (place / name).is_file():
             raise BadInput(f"{place / name} is missing; {AGAIN}")
