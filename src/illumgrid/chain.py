@@ -241,13 +241,9 @@ def usual_paths(before: dict[str, Any]) -> int:
 def _whole_numbers(paths: Any, bounces: Any, seed: Any) -> tuple[int | None, int | None, int]:
     """Check these options; numbers of any integer type become those of Python."""
     if paths is not None:
-        paths = _whole(
-            paths, 1, 2**31, "{} paths were asked for; expected a whole number, at least 1 and fewer than 2**31"
-        )
+        paths = _whole(paths, 1, 2**31, "got {} paths; expected a whole number, at least 1 and fewer than 2**31")
     if bounces is not None:
-        bounces = _whole(
-            bounces, 0, 2**31, "{} bounces were asked for; expected 0 (light straight from the lamps) to 2**31 - 1"
-        )
+        bounces = _whole(bounces, 0, 2**31, "got {} bounces; expected 0 (light straight from the lamps) to 2**31 - 1")
     return paths, bounces, _whole(seed, 0, 2**64, "the seed is {}; expected a whole number from 0 to 2**64 - 1")
 
 
@@ -372,13 +368,13 @@ def rounds(paths: int, fill: float, until: float, clock: Callable[[], float] = t
 def _check_plannable(error: float | None, seconds: float | None, sampler: Any, backend: Any, interpolator: Any) -> None:
     """Refuse a request for which no pilot can plan."""
     if error is not None and seconds is not None:
-        raise BadInput("both an error and a time were asked for; expected one of them")
+        raise BadInput("got both an error and a time; expected one of them")
     if error is not None and not 0 < error < 1:
-        raise BadInput(f"an error of {error:g} was asked for; expected a share of the mean light, such as 0.03")
+        raise BadInput(f"got an error of {error:g}; expected a share of the mean light, such as 0.03")
     if seconds is not None and not 0 < seconds < np.inf:
-        raise BadInput(f"{seconds:g} seconds were asked for; expected a positive number")
+        raise BadInput(f"got {seconds:g} seconds; expected a positive number")
     if (sampler.name, interpolator.name) != ("direct", "nearest") or capabilities(backend).surface == "mesh":
         raise BadInput(
-            f"an error or a time was asked for with {sampler.name}, {backend.name} and {interpolator.name}; expected "
+            f"got an error or a time with {sampler.name}, {backend.name} and {interpolator.name}; expected "
             "direct, a backend that marches level sets, and nearest: 'illumgrid bench' measures the others"
         )

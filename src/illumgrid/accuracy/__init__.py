@@ -1,1 +1,1 @@
-"""How far off a grid is, and what it costs."""
+"""The error of a grid, and its cost."""

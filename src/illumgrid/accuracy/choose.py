@@ -1,4 +1,4 @@
-"""No more than a scene needs: nodes, paths and bounces for an asked error or time, from a short pilot."""
+"""Choose nodes, paths and bounces for a requested error or time, from a short pilot measurement."""
 
 import time
 from collections.abc import Sequence
@@ -16,30 +16,30 @@ from illumgrid.field.scene import Levels, Scene, finer_texels
 from illumgrid.rng import shifted_seed
 from illumgrid.transport.tracer import Tracer
 
-SHARE = 0.25  # of the asked error that the bounces left out may be
-FOR_A_TIME = 0.02  # the error that a reference must judge where none is asked
-JUDGED = 0.95  # of the asked seconds: the rest is for the judgement at the end
-TRIAL_PATHS = 16  # from each node, with which grids are tried
-LOOKED_PATHS = 4  # the same where a first look chose the nodes
-MORE = 4  # times as many points from look to look
-IN_TIME, OF_LATTICES, OF_LOOKS = (64, 256, 1024, 4096), (384, 1536, 6144), (1536, 6144)  # points; two for an error
-SOON = 5.0  # seconds that a look at the most points may take even before a shorter run
-CRUDE, LONG = 0.1, 60.0  # relative error, and seconds, beyond which a plan is announced with an alternative
-MOST_NODES = 40_000_000  # a grid of about 2 GB with all that belongs to it
+SHARE = 0.25  # fraction of the requested error that omitted bounces may cause
+FOR_A_TIME = 0.02  # the error that a reference must resolve if a time is requested
+JUDGED = 0.95  # fraction of the requested seconds: the rest is for measuring the error at the end
+TRIAL_PATHS = 16  # per node, to measure runs on lattices
+LOOKED_PATHS = 4  # per node, if a first look chose the nodes
+MORE = 4  # factor on the points from round to round
+IN_TIME, OF_LATTICES, OF_LOOKS = (64, 256, 1024, 4096), (384, 1536, 6144), (1536, 6144)  # points; last 2: for an error
+SOON = 5.0  # seconds that a further round for an error may always take
+CRUDE, LONG = 0.1, 60.0  # relative error, and seconds, beyond which a warning names an alternative
+MOST_NODES = 40_000_000  # a grid of about 2 GB, with everything that belongs to it
 
 
 @dataclass(frozen=True)
 class Goal:
-    """What is asked of a run, and what is not left to choose."""
+    """The error or time that a run should reach, and the settings that are given."""
 
-    error: float | None = None  # relative, root mean square, to reach in the least time; else the least in `seconds`
+    error: float | None = None  # relative root mean square error; None: the least one in `seconds`
     seconds: float = np.inf
-    texels: int = 0  # of the walls, which take their time too
+    texels: int = 0  # of the walls, which take time as well
     paths: int | None = None
     bounces: int | None = None
 
     def work(self, nodes: int) -> int:
-        """Nodes that take as long as these together with the texels."""
+        """Number of nodes that take as long as `nodes` nodes and the texels."""
         return nodes + self.texels * texel_paths(nodes, self.texels)
 
 
@@ -56,29 +56,29 @@ class Choice:
 
 @dataclass(frozen=True)
 class Plan:
-    """What the pilot chose, and why."""
+    """The settings that the pilot chose, and the reasons."""
 
     grid: int
     paths: int
-    bounces: int | None  # None: as many as a run takes by itself, whose paths end in the light of the first look
+    bounces: int | None  # None: those of a default run, whose paths end in the light of the first look
     error: float  # predicted, relative
     seconds: float  # predicted, of the run
-    fill: float  # seconds of those that go into queries and grids, not into paths
-    met: bool  # whether the asked error, or time, is predicted to be kept
+    fill: float  # those of these seconds that go into queries and grids, not into paths
+    met: bool  # whether the prediction keeps to the requested error or time
     why: tuple[str, ...]  # sentences for the user
-    finer: float = 1.0  # texels of walls along each edge, for each of the scene's
-    looked: bool = False  # whether a first look at a lattice of `grid` nodes chooses those that are lit
-    outlook: str = ""  # said before the light is computed: a time that is too short, an error that takes long
+    finer: float = 1.0  # factor on the scene's number of texels along each edge of a wall
+    looked: bool = False  # whether a first look at a lattice of `grid` nodes chooses the nodes to light
+    outlook: str = ""  # warning before the light is computed: too short a time, or an error out of reach or slow
 
 
 def sizes(scene: Scene) -> list[int]:
-    """Grid sizes worth trying, in steps of about √2, up to two nodes for each voxel's side."""
+    """Nodes along the longest axis of the grids to try: in steps of about √2, up to two nodes per voxel."""
     longest = max(max(field.volume.shape) for field in scene.fields)
     return [max(4, round(longest * 2.0 ** (k / 2))) for k in range(-8, 3) if longest * 2.0 ** (k / 2) > 5]
 
 
 def choose(tried: Sequence[Measured], goal: Goal) -> Choice:
-    """The least time for an error, or else the least error for a time; if neither can be had, what comes nearest."""
+    """Choose the least time for an error, or the least error for a time; if no run keeps to it, the closest one."""
 
     def choice(m: Measured, count: int, met: bool) -> Choice:
         return Choice(m, count, float(np.sqrt(m.squared(count))), m.seconds(goal.work(m.nodes), count), met)
@@ -90,7 +90,7 @@ def choose(tried: Sequence[Measured], goal: Goal) -> Choice:
         if kept:
             return min(kept, key=lambda c: c.seconds)
         least = min(m.floor for m in tried)
-        best = min((m for m in tried if m.floor <= 1.2 * least), key=lambda m: m.nodes)  # a tenth off, no more
+        best = min((m for m in tried if m.floor <= 1.2 * least), key=lambda m: m.nodes)  # at most a tenth more error
         return choice(best, goal.paths or best.paths_for(1.25 * best.floor) or 64, False)
     able = [goal.paths or m.paths_in(goal.seconds, goal.work(m.nodes)) for m in tried]
     kept = [choice(m, n, True) for m, n in zip(tried, able) if n >= FEWEST_PATHS]
@@ -101,23 +101,23 @@ def choose(tried: Sequence[Measured], goal: Goal) -> Choice:
 
 @dataclass(frozen=True, eq=False)
 class Pilot:
-    """Tries runs of more and more nodes, at more and more points: of lattices, or of nodes that first looks choose."""
+    """Measures runs of increasing size at ever more points: on lattices, or on nodes that first looks choose."""
 
     scene: Scene
     tracer: Tracer
     goal: Goal
     looking: bool  # whether a first look chooses the nodes
-    followed: int  # bounces, where no light is known in which paths end
+    followed: int  # bounces on lattices, where paths end in no cache
     seed: int  # of the run
-    until: float  # of the clock: then the run is to end
-    ahead: dict[int, Ahead] = field(default_factory=dict)  # by size, those tried so far
+    until: float  # of `time.perf_counter`: when the run should end
+    ahead: dict[int, Ahead] = field(default_factory=dict)  # by size, those measured so far
 
     def tried(self, sizes: Sequence[int]) -> list[Measured]:
-        """Runs of the sizes that may be the choice, measured at more and more points as long as they are worth it.
+        """Measure runs of the sizes that may be chosen, at more points from round to round while this pays.
 
-        For a time while a look takes less than a sixth of the run. For an error at many points in any case, for at few
-        a run may be good enough by chance, with every finer run in turn until one will do; and at more while they
-        differ too much to tell. First looks begin with many: nodes that lookups read are then soon the same.
+        For a time, a further round may take up to a sixth of the run. For an error, runs are measured at many points in
+        any case, since at few a coarse run may seem to suffice by chance; finer runs follow in turn until one suffices,
+        and further points while the estimate is uncertain. First looks begin with many points, whose nodes soon repeat.
         """
         goal, near = self.goal, sizes
         counts = IN_TIME if goal.error is None else OF_LOOKS if self.looking else OF_LATTICES
@@ -136,14 +136,14 @@ class Pilot:
         return found
 
     def look(self, sizes: Sequence[int], points: int, seed: int) -> tuple[list[Measured], dict[int, float]]:
-        """Runs measured at some points, from coarse to fine, until finer ones cannot be the choice.
+        """Measure runs at some points, from coarse to fine, until finer ones cannot be the choice.
 
-        And the seconds that each took, without its first look, which is taken once.
+        Also returns the seconds that each took, without its first look, which is taken only once.
         """
         probe = Probe.start(self.scene, self.tracer, points, self.goal.error or FOR_A_TIME, seed)
         found, took, last = list[Measured](), dict[int, float](), 0.0
         for left, size in zip(range(len(sizes), 0, -1), sizes):
-            if found and self._enough(found, left, size, last if len(found) > 1 else 0.0):  # the first loads kernels
+            if found and self._enough(found, left, size, last if len(found) > 1 else 0.0):  # 1st loads kernels
                 break
             begun = time.perf_counter()
             if size not in self.ahead:
@@ -158,18 +158,18 @@ class Pilot:
         return found, took
 
     def _enough(self, found: Sequence[Measured], left: int, size: int, took: float) -> bool:
-        """Whether a run of the next size, and the finer ones `left`, cannot be the choice, or take too long to try."""
+        """Whether the `left` remaining sizes, from `size` on, cannot be the choice or take too long to measure."""
         goal, now = replace(self.goal, texels=0), found[-1]
         times: float = (size / now.grid) ** 3
-        takes = times**0.75 * took  # part of it is the same for any size
+        takes = times**0.75 * took  # part of the time does not depend on the size
         if now.nodes > MOST_NODES:
             return True
         if goal.error is None:
             return bool(time.perf_counter() + takes + times * now.seconds(now.nodes, FEWEST_PATHS) > self.until)
         best = choose(found, replace(goal, paths=None))
-        if not best.met:  # each finer one has at best half the error
+        if not best.met:  # each finer size at best halves the error
             return now.floor > (2.0**left * goal.error) ** 2 or takes > LONG
-        # A finer one has twice the nodes or more, and needs the paths that the noise alone asks for.
+        # A finer run has at least twice the nodes, and at least the paths that the noise alone requires.
         least = now.seconds(2 * now.nodes, now.paths_within(goal.error**2))
         return bool(max(least, takes) >= best.seconds)
 
@@ -188,11 +188,11 @@ def planned(
     looking: bool = False,
     seed: int = 0,
 ) -> tuple[Plan, Ahead | None]:
-    """Choose nodes, paths and bounces of a run with `Direct` and `Nearest`, as far as they are not given.
+    """Choose those of nodes, paths and bounces that are not given, for a run with `Direct` and `Nearest`.
 
-    In the least time for a relative root mean square `error`, or the least error in `seconds`, with this choice and the
-    light of walls at `levels` included; the tracer marches level sets. For an error, texels as well: of each wall, at
-    least as many as it has. If `looking`, a first look chooses the nodes, which comes with the plan.
+    The run takes the least time for a relative root mean square `error`, or has the least error in `seconds`, with this
+    pilot and the light of walls at `levels` included. The tracer marches level sets. For an error, the texels of walls
+    are chosen, too, at least the scene's. If `looking`, a first look chooses the nodes, and is returned as well.
     """
     begun = time.perf_counter()
     left = np.inf if seconds is None else JUDGED * seconds
@@ -216,9 +216,9 @@ def planned(
 
 
 def outlook(tried: Sequence[Measured], goal: Goal, choice: Choice, pilot: float) -> str:
-    """What a user should know before the light is computed; empty if the run is short and as good as asked.
+    """Warning for the user before the light is computed; empty if the run is short and accurate enough.
 
-    Times that another goal would take include the seconds of the pilot, as those of `goal` do.
+    The time of another goal includes the seconds of the `pilot`, as the time of `goal` does.
     """
     if goal.error is None:
         if choice.met and choice.error <= CRUDE:
@@ -247,17 +247,17 @@ def _time(seconds: float) -> str:
 
 
 def reasons(scene: Scene, choice: Choice, bounces: int | None, walls: Walls | None = None) -> tuple[str, ...]:
-    """What was chosen, why, and what was left out, in sentences; `bounces` are None where a first look has its own."""
+    """Each choice with its reason, and what is omitted, in sentences; `bounces` is None if a first look has its own."""
     m, part = choice.measured, choice.measured.parts
     still, noise = np.sqrt(max(0.0, part.grid + part.uncovered)), np.sqrt(max(0.0, m.squared(choice.paths) - m.floor))
     longest = f"{m.grid} nodes along the longest axis"
     paths = f"{choice.paths} paths: noise of {noise:.1%} after interpolation"
     if bounces is None:
         chosen = f"a first look at {longest} chose {m.nodes} to light"
-        return f"{chosen}: interpolation between them is off by {still:.1%}", paths
+        return f"{chosen}: interpolation between them has an error of {still:.1%}", paths
     nodes = sum(int(np.prod(spec.shape)) for spec in specs_over(scene, m.grid))
     said = (
-        f"{longest}: interpolation between them is off by {still:.1%}",
+        f"{longest}: interpolation between them has an error of {still:.1%}",
         paths,
         f"{bounces} bounces: further ones would add {np.sqrt(part.bounces):.1%}",
         f"{nodes - m.nodes} of {nodes} nodes are omitted: no isosurface of the range is near them",
@@ -265,4 +265,4 @@ def reasons(scene: Scene, choice: Choice, bounces: int | None, walls: Walls | No
     if walls is None:
         return said
     texels = max(n for quad in finer_texels(scene, walls.finer).quads for n in quad.texels)
-    return *said, f"{texels} texels along walls: between them and rows of the sweep light is off by {walls.off:.1%}"
+    return *said, f"{texels} texels along walls: interpolation there and in the sweep has an error of {walls.off:.1%}"

@@ -1,4 +1,4 @@
-"""The error that a finished run has reached, and what would lessen it."""
+"""The error that a finished run has reached, and what would reduce it."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -27,14 +27,14 @@ def judge(
     scene: Scene, tracer: Tracer, unseen: Callable[[Scene, int, int], Queries], held: Callable[[Queries], Floats],
     seed: int, queries: int, paths: int, bounces: int,
 ) -> Errors | None:  # fmt: skip
-    """Error of the light that grids or walls hold where no run asks; None where there is no light or nothing to show.
+    """Error of the light of grids or walls at points that no run samples; None without light or without such points.
 
-    `unseen` makes points from a scene, a number and a seed; `held` looks up light (n, 3) at them. Walls behind nothing
-    are smooth and many, so that an error at shadows alone counts little there: see `Errors.p95`.
+    `unseen` makes points from a scene, a number and a seed; `held` looks up light (n, 3) at them. Light is smooth
+    on most of the area of walls, so that an error in shadows alone counts little there: see `Errors.p95`.
 
-    For a twentieth of the run's work, or what 1024 points take: as many paths as the run had, which makes the
-    reference as sharp as it is, and the more points, for where the light is rough a few of them carry the error.
-    The path count is fixed in advance; stopping once the reference looks sharp enough would bias the estimate.
+    Takes a twentieth of the run's work, or that of 1024 points if it is more: up to as many paths per point as the run
+    had, which makes the reference as accurate, and more points, since a few carry the error where light is rough.
+    The path count is fixed in advance: stopping once the reference looks accurate enough would bias the estimate.
     """
     seed = shifted_seed(seed, 2)
     followed, _ = enough_bounces(scene, tracer, seed, 1e-3)
@@ -46,9 +46,9 @@ def judge(
 
 
 def remedies(scene: Scene, backend: Backend, specs: Sequence[GridSpec], bounces: int, seed: int) -> dict[str, float]:
-    """Relative error without noise of grids as they are, of `--grid` with twice the nodes, and of a smoothed field.
+    """Relative error without noise of the present grids, of `--grid` with twice the nodes, and of a smoothed field.
 
-    A field of more than `_SMALL` voxels is not smoothed: the copy would be larger than all else of the run; infinite.
+    The last is infinite for more than `_SMALL` voxels: the smoothed copy would take more memory than the whole run.
     """
     tried = [("now", scene, specs), ("finer", scene, specs_over(scene, 2 * along_longest(specs)))]
     if all(f.volume.stored.size <= _SMALL for f in scene.fields):
@@ -58,7 +58,7 @@ def remedies(scene: Scene, backend: Backend, specs: Sequence[GridSpec], bounces:
     for what, of, nodes in tried:
         try:  # few points and paths: a hint must not cost more than the run
             probe = Probe.start(of, prepare(backend, of), 512, 0.05, seed)
-        except BadInput:  # no light where it looked
+        except BadInput:  # no light at these points
             return {}
         part = probe.measure(lattice(nodes, probe.reference.tracer, bounces), 32).parts
         found[what] = float(np.sqrt(max(0.0, part.total - part.noise)))

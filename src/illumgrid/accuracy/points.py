@@ -1,4 +1,4 @@
-"""Points at which light is judged: on level sets and walls, between the nodes, texels and rows that a run lights."""
+"""Points at which errors are measured: on level sets and walls, between the nodes, texels and rows of a run."""
 
 import numpy as np
 
@@ -10,12 +10,12 @@ from illumgrid.transport.samples import Queries, join_queries
 
 
 def other_paths(seed: int) -> int:
-    """A seed whose paths have nothing in common with those of `seed`."""
+    """A seed whose paths are independent of those of `seed`."""
     return shifted_seed(seed, 2**63)
 
 
 def unseen_on_level_sets(scene: Scene, levels: int, points: int, seed: int) -> Queries:
-    """About `points` uniform by area on level sets of their own, one at random from each of `levels` equal steps."""
+    """About `points` points, uniform by area on random level sets: one in each of `levels` equal steps of the sweep."""
     random = np.random.default_rng((other_paths(seed), 1))
     rows = scene.levels((np.arange(levels) + random.random(levels)) / levels)
     each = max(1, round(points / (levels * len(scene.fields))))
@@ -25,12 +25,12 @@ def unseen_on_level_sets(scene: Scene, levels: int, points: int, seed: int) -> Q
 
 
 def unseen_in_volume(scene: Scene, points: int, seed: int) -> Queries:
-    """As `unseen_on_level_sets`, but each point on a level set of its own, and no surface is extracted."""
+    """Like `unseen_on_level_sets`, but each point has a level set of its own, and no surface is extracted."""
     return points_on_level_sets(scene, points, (other_paths(seed), 2))
 
 
 def unseen_on_walls(scene: Scene, points: int, seed: int) -> Queries:
-    """Points uniform by area on the fronts of quads that reflect, each at a setting of the sweep of its own."""
+    """Points uniform by area on the fronts of quads that reflect, each at a random position of the sweep."""
     shown = [number for number, quad in enumerate(scene.quads) if quad.material.albedo.any()]
     if not shown:
         return Queries.at(scene, np.zeros((0, 3)))

@@ -1,8 +1,8 @@
-"""The error of a run of some size, before it is built.
+"""Measure error and time of a run of a given size without building its grid.
 
-The light that a grid would hold at a point is known from the nodes around it: of a lattice whose nodes `Direct` asks,
-from eight. The probe lights those for some points and compares with the light at the points: that measures the error of
-a run, and its time, without building it.
+The light that a grid would have at a point follows from the nodes around it; of a lattice with the queries of `Direct`,
+these are eight. The probe lights the nodes around some points and compares the interpolated light with a reference at
+these points.
 """
 
 import time
@@ -27,19 +27,19 @@ FEWEST_PATHS, MOST_PATHS = 4, 1 << 16  # from each node of a planned run
 
 @dataclass(frozen=True)
 class Measured:
-    """The error of runs of one size with one number of paths, in parts, and their time."""
+    """The error of a run of one size with one number of paths, in parts, and its time."""
 
-    grid: int  # nodes along the longest axis, of the lattice that is lit or that a first look is taken at
-    nodes: int  # to light, in all
+    grid: int  # nodes along the longest axis, of the lattice that is lit or that of the first look
+    nodes: int  # to light, in total
     parts: Parts
     paths: int
-    node: float  # seconds for each node
-    path: float  # and for each path of a node
-    falls: float = 1.0  # the noise (squared) falls as paths to this power; more than 1 for well-spread paths
+    node: float  # seconds per node, without its paths
+    path: float  # seconds per path of a node
+    falls: float = 1.0  # variance of noise falls with this power of the paths; above 1 if well spread
 
     @property
     def floor(self) -> float:
-        """Mean squared error at any number of paths, and one standard error more: few points may carry it."""
+        """Mean squared error that more paths cannot reduce, plus one standard error, since few points may carry it."""
         return float(max(0.0, self.parts.total - self.parts.noise) + self.parts.uncertain)
 
     def squared(self, paths: int) -> float:
@@ -47,7 +47,7 @@ class Measured:
         return float(self.floor + self.parts.noise * (self.paths / paths) ** self.falls)
 
     def paths_for(self, squared: float) -> int | None:
-        """Fewest paths that are predicted to reach a mean squared error; None if none do."""
+        """Fewest paths that are predicted to reach a mean squared error; None if no number does."""
         return self.paths_within(squared - self.floor) if squared > self.floor else None
 
     def paths_within(self, noise: float) -> int:
@@ -56,29 +56,29 @@ class Measured:
         return min(MOST_PATHS, max(FEWEST_PATHS, 2 * int(np.ceil(needed / 2))))
 
     def seconds(self, nodes: int, paths: int) -> float:
-        """Predicted time of so many nodes."""
+        """Predicted time of this many nodes with this many paths each."""
         return nodes * (self.node + paths * self.path)
 
     def paths_in(self, seconds: float, nodes: int) -> int:
-        """Paths from each of the nodes that the time allows, an even number; below 0 if it allows none."""
+        """Paths per node that the time allows, an even number; 0 or negative if it allows none."""
         return min(MOST_PATHS, 2 * int((seconds / nodes - self.node) / self.path / 2))
 
 
 @dataclass(frozen=True, eq=False)
 class Probe:
-    """Points of a scene at which light is known, to measure runs against."""
+    """A reference at points of a scene, with which runs are compared."""
 
     scene: Scene
     seed: int
     reference: Reference
-    fewer: dict[int, Reference] = field(default_factory=dict)  # the same with fewer bounces
+    fewer: dict[int, Reference] = field(default_factory=dict)  # by bounces: the same paths, cut off after fewer
 
     @classmethod
     def start(cls, scene: Scene, tracer: Tracer, points: int, error: float, seed: int, most: int = 128) -> "Probe":
-        """Light some points well enough to judge an `error`, with paths so long that a tenth of it is left out.
+        """Light some points well enough to measure an `error`, with bounces that omit at most a tenth of it.
 
-        The reference's own variance is subtracted wherever it is used, so it may be as large as the error judged. It
-        has at most `most` paths: more points tell more than a sharper reference at each.
+        The reference's variance is subtracted wherever it is used, so its own error may be as large as the one that is
+        measured. It has at most `most` paths: more points say more than a more accurate reference at each.
         """
         followed, _ = enough_bounces(scene, tracer, seed, 0.1 * error)
         first = begin(tracer, unseen_in_volume(scene, points, seed), followed, seed)
@@ -87,19 +87,19 @@ class Probe:
         return cls(scene, seed, converge(first, error, most))
 
     def cut_off(self, bounces: int) -> Reference:
-        """The reference by the same paths, ended after fewer bounces."""
+        """The reference from the same paths, cut off after fewer bounces."""
         if bounces not in self.fewer:
             self.fewer[bounces] = self.reference.cut_off(bounces)
         return self.fewer[bounces]
 
     def measure(self, ahead: Ahead, paths: int) -> Measured:
-        """The error of a run before it is built, by `paths` paths from two seeds each, and its time."""
-        fewer = self.reference if ahead.cached else self.cut_off(ahead.bounces)  # in known light paths have no end
+        """Measure error and time of a run without building it, from `paths` paths with each of two seeds."""
+        fewer = self.reference if ahead.cached else self.cut_off(ahead.bounces)  # ending in a cache omits no bounces
         begun, parts = time.perf_counter(), list[Parts]()
         near = around(self.scene, ahead, self.reference.queries)
         asking, walking, reading = time.perf_counter() - begun, 0.0, 0.0
         pair = [Bake.of([near.asked], ahead.bounces, seed) for seed in (self.seed, shifted_seed(self.seed, 2**62))]
-        # How fast noise falls is seen by a quarter of the paths; of a first look there are too few.
+        # A quarter of the paths shows how fast noise falls; after a first look there are too few for that.
         rounds = [range(paths)] if ahead.refined else [range(paths // 4), range(paths // 4, paths)]
         for walked in rounds:
             begun = time.perf_counter()

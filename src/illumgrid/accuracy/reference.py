@@ -1,4 +1,4 @@
-"""Converged light at points that nobody asked for, and how far a grid is from it: noise, nodes, holes, bounces."""
+"""Reference light at unseen points, and the error of a grid in parts: noise, nodes, holes, bounces."""
 
 import time
 from dataclasses import dataclass, replace
@@ -17,13 +17,13 @@ from illumgrid.transport.tracer import Tracer
 
 @dataclass(frozen=True, eq=False)
 class Reference:
-    """Light at unseen points, with its own error: how far two halves from independent seeds differ.
+    """Light at unseen points, with its own error, estimated from the difference of two halves with independent seeds.
 
-    The error bars of the samples would not do: they are made to cover, and where light comes by few paths that is more.
+    The error bars of the samples are not used: they are upper estimates, too large where few paths carry the light.
     """
 
     tracer: Tracer
-    halves: tuple[Bake, Bake]  # of one batch of points each, without holes; as many paths in both
+    halves: tuple[Bake, Bake]  # of one batch of points each, without holes, with equally many paths
 
     def __len__(self) -> int:
         return len(self.queries)
@@ -57,7 +57,7 @@ class Reference:
 
     @property
     def off(self) -> Floats:
-        """Half the difference (n, 3) of the halves: its square has the variance of `light` for its expectation."""
+        """Half the difference (n, 3) of the halves; the expectation of its square is the variance of `light`."""
         one, other = (half.samples.mean for half in self.halves)
         return (one.astype(float) - other) / 2
 
@@ -68,30 +68,30 @@ class Reference:
 
     @property
     def error(self) -> float:
-        """Root mean square error of the reference itself, relative to the mean irradiance; 0 in the dark."""
+        """Root mean square error of the reference itself, relative to the mean irradiance; 0 without light."""
         return float(np.sqrt((self.off**2).mean())) / self.mean if self.mean > 0 else 0.0
 
     def walk(self, paths: int) -> "Reference":
-        """Walk on to this even number of paths from each point, half of them with each seed."""
+        """Trace more paths, up to this even number per point, half of them with each seed."""
         half = range(self.halves[0].paths, paths // 2)
         one, other = (h.walk(self.tracer, half) for h in self.halves)
         return replace(self, halves=(one, other))
 
     def cut_off(self, bounces: int) -> "Reference":
-        """The same paths, ended after fewer bounces."""
+        """The same paths, cut off after fewer bounces."""
         one, other = (Bake.of(h.targets, min(bounces, self.bounces), h.seed) for h in self.halves)
         return replace(self, halves=(one, other)).walk(self.paths)
 
 
 def begin(tracer: Tracer, asked: Queries, bounces: int, seed: int, paths: int = 64) -> Reference:
-    """Trace a few paths that no run of `seed` walks; points inside another field's solid are left out."""
+    """Trace a few paths that no run of `seed` traces; points inside another field's solid are omitted."""
     one, other = (Bake.of([asked], bounces, shifted_seed(other_paths(seed), k * 2**61)) for k in (0, 1))
     found = Reference(tracer, (one, other)).walk(paths)
     return found[found.halves[0].samples.paths > 0]
 
 
 def converge(reference: Reference, error: float, most: int = 1 << 14, until: float = np.inf) -> Reference:
-    """Go on until its own relative error is at most `error`, `most` paths are walked, or twice as many take too long.
+    """Trace more paths until the own relative error is at most `error`, there are `most`, or doubling takes too long.
 
     `until` is a time of `time.perf_counter`.
     """
@@ -107,17 +107,17 @@ def converge(reference: Reference, error: float, most: int = 1 << 14, until: flo
 
 @dataclass(frozen=True)
 class Errors:
-    """How far a grid is from the reference, all relative to the mean irradiance."""
+    """Error of a grid against a reference, relative to the mean irradiance."""
 
-    rmse: float  # root mean square, less the reference's own variance; a third of its own error is the least resolved
+    rmse: float  # root mean square, without the reference's variance; at least a third of the reference's own error
     uncertain: float  # standard error of `rmse`, from the spread over the points
-    median: float  # as p95, over points of the root mean square over colours
+    median: float  # like p95, a quantile over points of the root mean square over colours
     p95: float
-    bias: float  # mean difference; below 0 the grid is too dark
+    bias: float  # mean difference; negative if the grid is too dark
 
 
 def errors(light: Floats, reference: Reference) -> Errors:
-    """How far `light` (n, 3), looked up at the points of a reference, is from it."""
+    """Error of `light` (n, 3), looked up at the points of a reference."""
     off = (light - reference.light) / reference.mean
     square = (off**2).mean(axis=1)
     each, own = np.sqrt(square), reference.error
@@ -129,15 +129,15 @@ def errors(light: Floats, reference: Reference) -> Errors:
 
 @dataclass(frozen=True)
 class Parts:
-    """The mean squared error of a grid in parts, each measured; all as squares relative to the mean irradiance."""
+    """The mean squared error of a grid in parts, each measured; all relative to the squared mean irradiance."""
 
     noise: float  # half the mean squared difference of two grids from independent seeds
-    # What interpolation between nodes does, at points whose nodes all have light of their own: the mean product of the
-    # two grids' errors, in which noise cancels. An estimate of 0 may come out slightly negative.
+    # Error of interpolation between nodes, at points whose nodes all have light of their own: the mean product of the
+    # two grids' errors, in which noise cancels. Where it is 0, the estimate may be slightly negative.
     grid: float
     uncovered: float  # the same at points that read a node without support
     bounces: float  # mean square of the light that more bounces add at the points themselves
-    cross: float  # what the sum of the four lacks of the total: the grid's error and missing bounces are correlated
+    cross: float  # total less the other four: the grid's error and the missing bounces are correlated
     uncertain: float  # standard error of `grid`, from the spread over the points
 
     @property
@@ -147,15 +147,15 @@ class Parts:
 
 
 def parts_of(one: Floats, other: Floats, covered: NDArray[np.bool_], fewer: Reference, reference: Reference) -> Parts:
-    """Split the error of a grid, from what two that differ in their seeds hold, (n, 3), at the points of a reference.
+    """Split the error of a grid into parts, from the light (n, 3) of two with different seeds at a reference's points.
 
-    `covered` (n,) marks points whose nodes all have light of their own; `fewer` is the light at the points by the same
+    `covered` (n,) marks points whose nodes all have light of their own; `fewer` is the reference from the same
     paths, cut off after as many bounces as the grids had.
     """
     light, mean = fewer.light, reference.mean
     first, second = (one - light) / mean, (other - light) / mean
     more = (reference.light - fewer.light) / reference.mean
-    # The paths that stand for the exact light are in both errors: their own variance is subtracted.
+    # Both errors contain that of the reference, whose variance is therefore subtracted.
     both = (first * second).mean(axis=1) - (fewer.off**2).mean(axis=1) / mean**2
     inside = np.where(covered, both, 0.0)
     return Parts(

@@ -1,7 +1,7 @@
-"""Texels for an asked error: how far walls of some texels would be off, before they are lit.
+"""Choose the texels of walls for a requested error, from the error of several choices before walls are lit.
 
-As for grids: a lookup on a wall reads eight texels, two of each axis and two rows of the sweep. Those around some
-points are lit, and what they hold there is compared with the light at the points.
+As for grids: a lookup on a wall reads eight texels, two along each axis in each of two rows of the sweep. Those around
+some points are lit, and the light interpolated from them is compared with a reference at the points.
 """
 
 from dataclasses import dataclass
@@ -17,25 +17,25 @@ from illumgrid.rng import shifted_seed
 from illumgrid.transport.tracer import Tracer
 
 FINER = (1.0, 2**0.5, 2.0, 8**0.5, 4.0)
-"""Texels along each edge that are tried, for each of the scene's."""
+"""Factors that are tried, on the scene's number of texels along each edge."""
 POINTS, REFERENCE_PATHS, PATHS = 512, 128, 16
-SHARE = 0.7  # of the asked error that texels may be off: the rest is noise
-GAIN = 0.9  # of the error of coarser texels, above which finer ones are not worth their time
+SHARE = 0.7  # fraction of the requested error that interpolation between texels may cause: the rest is for noise
+GAIN = 0.9  # finer texels are worth their time if their error is below this fraction of that of coarser ones
 
 
 @dataclass(frozen=True)
 class Walls:
-    """How finely walls are divided, and by how much reading between texels and rows is then off, relative."""
+    """Texels of walls, and the relative error of interpolation between them and between rows."""
 
-    finer: float  # texels along each edge for each of the scene's
+    finer: float  # factor on the scene's number of texels along each edge
     off: float
 
 
 def walls_for(scene: Scene, tracer: Tracer, levels: Levels, bounces: int, error: float, seed: int) -> Walls | None:
-    """The fewest texels, from the scene's up, between which light is off by less than its share of an error.
+    """Choose the fewest texels, at least the scene's, with an interpolation error of at most `SHARE` of `error`.
 
-    Where none will do, as where rows of the sweep are too far apart, the fewest that are not much worse than the best;
-    None without walls to show, and in the dark.
+    If none suffice, for instance if rows of the sweep are too far apart: the fewest that are not much worse than the
+    best. None without walls that reflect, or without light on them.
     """
     truth = begin(tracer, unseen_on_walls(scene, POINTS, seed), bounces, seed, REFERENCE_PATHS)
     if not truth.mean > 0:

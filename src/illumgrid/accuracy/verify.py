@@ -1,4 +1,4 @@
-"""Closed forms against backends: a table of z-scores."""
+"""Compare backends with closed forms: a table of z-scores."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 
@@ -8,12 +8,12 @@ from illumgrid.stages import Backend
 from illumgrid.transport.agreement import Row, applies, judge, sidak
 from illumgrid.transport.analytic import CASES, Case
 
-_FALSE_ALARM = 1e-3  # probability that a table of right answers has a row that disagrees
-_SLOWER = {"reference": 128, "embree": 8}  # times fewer paths
+_FALSE_ALARM = 1e-3  # probability that a table of correct results has a row that disagrees
+_SLOWER = {"reference": 128, "embree": 8}  # slow backends: factor by which they trace fewer paths
 
 
 def contenders(names: Iterable[str] = ()) -> dict[str, Backend]:
-    """Backends of light by the names of the table: those named, or all that work here; "numba" is both surfaces."""
+    """Backends that compute light, by name in the table: those named, or all that work; "numba" means both surfaces."""
     able = {title: stage for title, stage, can in registry.backends() if can.transport}
     found: dict[str, Backend] = {}
     for name in names:
@@ -25,13 +25,13 @@ def contenders(names: Iterable[str] = ()) -> dict[str, Backend]:
 def check(
     backends: Mapping[str, Backend], paths: int = 1 << 18, seed: int = 0, cases: Sequence[Case] | None = None
 ) -> Iterator[Row]:
-    """Judge every case with every backend; yield each row as soon as it is judged.
+    """Test every backend on every case; yield each row as soon as it is computed.
 
-    The queries of a case share its `paths`, of which slow backends trace fewer. Right answers get a row that disagrees
-    once in a thousand tables.
+    The queries of a case share its `paths`, of which slow backends trace fewer. Correct results give a row that
+    disagrees in one of a thousand tables.
     """
     if not 1 <= paths < 2**31:
-        raise BadInput(f"{paths} paths were asked for; expected at least 1 and fewer than 2**31")
+        raise BadInput(f"got {paths} paths; expected at least 1 and fewer than 2**31")
     cases = [make() for make in CASES] if cases is None else cases
     level = _FALSE_ALARM / 2  # one half for the means, one for the single queries
     limit = sidak(max(1, 3 * len(cases) * len(backends)), level)

@@ -185,7 +185,7 @@ class Embree:
         if cure := self.available():
             raise BadInput(f"the backend 'embree' needs the package embreex, which is not installed; run: {cure}")
         if self.threads < 0:
-            raise BadInput(f"{self.threads} threads were asked for; expected a positive number, or 0 for all")
+            raise BadInput(f"got {self.threads} threads; expected a positive number, or 0 for all")
 
     @classmethod
     def available(cls) -> str | None:

@@ -54,7 +54,7 @@ class Numba:
 
     def __post_init__(self) -> None:
         if self.threads < 0:
-            raise BadInput(f"{self.threads} threads were asked for; expected a positive number, or 0 for all")
+            raise BadInput(f"got {self.threads} threads; expected a positive number, or 0 for all")
         if self.surface not in ("auto", "levelset", "mesh"):
             raise BadInput(f"the surface is {self.surface!r}; expected 'auto', 'levelset' or 'mesh'")
 

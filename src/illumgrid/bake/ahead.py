@@ -71,12 +71,12 @@ def light_ahead(
 
 
 def lattice(specs: Sequence[GridSpec], tracer: Tracer, bounces: int) -> Ahead:
-    """All nodes of some lattices, with nothing lit ahead."""
+    """All nodes of some lattices, with no light computed before."""
     return Ahead(specs, Direct(), tracer, Nearest(), bounces=bounces)
 
 
 def looked(scene: Scene, tracer: Tracer, longest: int | None, bounces: int | None, seed: int) -> Ahead:
-    """What `run` lights ahead from a lattice of so many nodes; by default its own nodes and bounces."""
+    """The first look of `run` at lattices of `longest` nodes along the longest axis; None: the defaults of `run`."""
     return light_ahead(
         scene, specs_over(scene, longest, BASE), level_table(scene, 2), tracer, (None, None, None), refining=True,
         cached=False, automatic=bounces is None, seed=seed,
@@ -85,10 +85,10 @@ def looked(scene: Scene, tracer: Tracer, longest: int | None, bounces: int | Non
 
 
 def nodes_to_light(scene: Scene, ahead: Ahead) -> int:
-    """How many nodes a run asks."""
+    """Number of nodes that a run lights."""
     if isinstance(ahead.sampler, Chosen):
         return sum(map(len, ahead.sampler.nodes))
-    # The numbers of the nodes would take eight times more than which they are.
+    # Masks take an eighth of the memory of node numbers.
     return sum(int(np.count_nonzero(reached(field, spec))) for field, spec in zip(scene.fields, ahead.specs))
 
 

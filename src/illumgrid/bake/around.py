@@ -1,4 +1,4 @@
-"""What grids hold at the points of queries, once they are built; and the nodes, or texels, that lookups there read."""
+"""Light of built grids at the points of queries, and the nodes or texels on which lookups at these points depend."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,11 +20,11 @@ from illumgrid.samplers.direct import Corners, Part, at_nodes, corners
 from illumgrid.transport.samples import Queries, Samples, join_queries
 
 BESIDE = 2
-"""Nodes beside those of a cell, along each axis, that these read."""
+"""Nodes on either side of those of a cell, along each axis, from which these may be filled."""
 
 
 def look_up(grids: Sequence[IlluminationGrid], asked: Queries) -> tuple[Floats, NDArray[np.bool_]]:
-    """Light (n, 3) that grids hold at the points of queries, each in the grid of its field; and as `Corners.read`."""
+    """Light (n, 3) at the points of queries, in the grid of the field of each; and coverage (n,), as `Corners.read`."""
     light, covered = np.zeros((len(asked), 3)), np.zeros(len(asked), bool)
     for number, grid in enumerate(grids):
         own = asked.target == number
@@ -34,7 +34,7 @@ def look_up(grids: Sequence[IlluminationGrid], asked: Queries) -> tuple[Floats, 
 
 @dataclass(frozen=True, eq=False)
 class Around:
-    """Nodes around some points, as `Corners`, of a run whose nodes read those beside them."""
+    """Nodes around some points, like `Corners`, for an interpolator that fills nodes from those beside them."""
 
     scene: Scene
     ahead: Ahead
@@ -47,7 +47,7 @@ class Around:
 
 
 def around(scene: Scene, ahead: Ahead, points: Queries) -> Corners | Around:
-    """The nodes that a lookup at some points reads: the eight of each point, or as many as fill those."""
+    """The nodes on which lookups at points depend: eight per point for `Nearest`, else all that fill the eight."""
     if ahead.interpolator == Nearest():
         return corners(scene, ahead.specs, points)
     sampler, parts = ahead.sampler, list[Queries]()
@@ -66,7 +66,7 @@ def around(scene: Scene, ahead: Ahead, points: Queries) -> Corners | Around:
 
 
 def texels_around(scene: Scene, levels: Levels, points: Queries) -> Corners:
-    """The eight texels that a lookup at each of some points on walls reads."""
+    """The eight texels that a lookup at each point on a wall reads."""
     quad, u, v, t = place_on_walls(scene, points)
 
     def part(number: int) -> Part:

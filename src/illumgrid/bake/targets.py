@@ -79,10 +79,10 @@ def of_field(scene: Scene, answers: Sequence[Samples], number: int) -> Samples:
 def filled(
     scene: Scene, specs: Sequence[GridSpec], interpolator: Interpolator, answers: Sequence[Samples]
 ) -> Iterator[IlluminationGrid]:
-    """The grid of each field, one after the other, from the light at all of its nodes, or at some of them."""
+    """The grid of each field in turn, from samples at all or some of its nodes."""
     for number, (field, spec) in enumerate(zip(scene.fields, specs)):
         samples = of_field(scene, answers, number)
-        answers = [a for a in answers if (a.queries.target > number).any()]  # a large run is held once, not twice
+        answers = [a for a in answers if (a.queries.target > number).any()]  # holds a large run once, not twice
         grid = fill_nodes(interpolator, samples, Nodes(spec, field, number))
         del samples
         yield grid

@@ -34,7 +34,7 @@ class GridSpec:
     def __post_init__(self) -> None:
         shape = tuple(int(n) for n in self.shape)
         if len(shape) != 3 or min(shape) < 2:
-            raise BadInput(f"a grid of shape {shape} was asked for; expected at least 2 nodes along each of three axes")
+            raise BadInput(f"got a grid of shape {shape}; expected at least 2 nodes along each of three axes")
         object.__setattr__(self, "shape", shape)
         for name, value in zip(
             ("origin", "spacing", "direction"), placement(self.origin, self.spacing, self.direction)
@@ -50,8 +50,7 @@ class GridSpec:
         """
         if not 2 <= longest <= MOST_NODES:
             raise BadInput(
-                f"a grid of {longest} nodes was asked for; expected at least 2 and at most {MOST_NODES} along the "
-                "longest axis"
+                f"got a grid of {longest} nodes; expected at least 2 and at most {MOST_NODES} along the longest axis"
             )
         voxels = np.array(lattice.shape)
         # floor(x + 1/2): Python and NumPy round halves to even, which is not what a reader of the formula expects.

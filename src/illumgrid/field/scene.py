@@ -304,7 +304,7 @@ MOST_LEVELS = 2**20  # rows of a level table: far more than any grid resolves
 def level_table(scene: Scene, count: int) -> Levels:
     """`count` equal steps of the common sweep, both ends included."""
     if not 2 <= count <= MOST_LEVELS:
-        raise BadInput(f"{count} isovalues were requested; expected at least 2 and at most {MOST_LEVELS}")
+        raise BadInput(f"got {count} isovalues; expected at least 2 and at most {MOST_LEVELS}")
     return Levels(scene.levels(np.linspace(0.0, 1.0, count)))
 
 
@@ -318,7 +318,7 @@ def with_texels(scene: Scene, longest: int) -> Scene:
     """
     walls = [quad for quad in scene.quads if quad.material.albedo.any()]
     if not walls:
-        raise BadInput(f"{longest} texels were asked for in a scene without walls; expected a floor, a box or quads")
+        raise BadInput(f"got {longest} texels for a scene without walls; expected a floor, a box or quads")
     edge = max(float(np.linalg.norm(edge)) for quad in walls for edge in (quad.edge_u, quad.edge_v))
     return replace(
         scene,

@@ -53,7 +53,7 @@ def signed_pair(
     lowest, highest = volume.extremes
     if not (lowest <= -low and low <= highest):
         raise BadInput(
-            f"a signed field was asked for, with surfaces at +c and -c from c = {low:g} on, but the data run from "
+            f"got a signed field with surfaces at +c and -c from c = {low:g} on, but the data run from "
             f"{shown_range((lowest, highest), 6)}; expected both signs: choose a smaller c, or light the field unsigned"
         )
     one, other = (material, material) if material else (Material(np.array(c)) for c in (POSITIVE, NEGATIVE))

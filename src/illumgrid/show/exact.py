@@ -58,7 +58,7 @@ class Exact:
 
     def __post_init__(self) -> None:
         if not 1 <= self.paths <= MOST_PATHS:
-            raise BadInput(f"{self.paths} paths per pixel were asked for; expected 1 to {MOST_PATHS}")
+            raise BadInput(f"got {self.paths} paths per pixel; expected 1 to {MOST_PATHS}")
 
 
 def cache_at(light: Illumination, share: float) -> Cache:
@@ -144,7 +144,7 @@ class Gathering:
     def __post_init__(self) -> None:
         if self.width * self.height > MOST_PIXELS:
             raise BadInput(
-                f"an exact picture of {self.width} x {self.height} pixels was asked for; expected at most "
+                f"got an exact picture of {self.width} x {self.height} pixels; expected at most "
                 f"{MOST_PIXELS / 1e6:.0f} million"
             )
 

@@ -189,7 +189,7 @@ def check_request(paths: range, bounces: int) -> None:
     if not isinstance(paths, range) or paths.step != 1 or paths.start < 0:
         raise BadInput(f"paths is {paths!r}; expected a range of path numbers from 0 up with step 1, such as range(64)")
     if bounces < 0:
-        raise BadInput(f"{bounces} bounces were requested; expected 0 (light straight from the sky) or more")
+        raise BadInput(f"got {bounces} bounces; expected 0 (light straight from the sky) or more")
 
 
 def combine(one: Samples, other: Samples) -> Samples:

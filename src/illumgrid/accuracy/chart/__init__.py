@@ -1,4 +1,4 @@
-"""The speed-accuracy chart: seconds against error, for everything that is registered, on the user's own data."""
+"""The speed-accuracy chart: seconds against error of all registered stages, on the user's own data."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -35,29 +35,29 @@ REFERENCES, PARTS, PICTURE = 0.25, 0.12, 0.05  # for the references, the parts o
 OTHER = 0.05  # to begin the reference of another surface, at most
 DEFAULT, PREDICTED = 0.3, 0.15  # for `run`'s default, at most; if that is too little, to predict such grids
 
-GOAL, FEWEST = 0.01, 500  # own error of a reference, for which points are dropped where light is rough, to so many
-LONGEST = 1e7  # seconds of a budget: four months; counts of paths in proportion to it stay whole numbers
+GOAL, FEWEST = 0.01, 500  # own error of a reference; points are dropped to reach it, down to `FEWEST`
+LONGEST = 1e7  # seconds of a budget, four months: paths in proportion to it stay a finite number
 PARTS_PATHS, PARTS_REFERENCE, PARTS_POINTS = (16, 64, 256), 256, (512, 4096)
 
-# From a scene, its tracer, an exposure, bounces, a seed and paths for a converged picture: what compares grids with it.
+# Takes scene, tracer, exposure, bounces, seed and paths of a converged picture; returns what compares grids with it.
 Studio = Callable[[Scene, Tracer, float, int, int, float], Flip | None]
 
 
 @dataclass(frozen=True, eq=False)
 class Report:
-    """What a race showed."""
+    """Results of a race."""
 
     points: tuple[Point, ...]
     front: tuple[Point, ...]  # from fast to accurate
     references: dict[str, Reference]  # by surface
     parts: tuple[Measured, ...]  # of the error of `Direct` with `Nearest`, over grids and paths
     bounces: int
-    notes: tuple[str, ...]  # which backends do not compete, and why; whatever else a reader must know
-    seconds: float  # that all of it took, from warm kernels on
+    notes: tuple[str, ...]  # which backends do not compete, and why; what else a reader must know
+    seconds: float  # of the whole race, after compilation
 
 
 def sizes(scene: Scene) -> list[int]:
-    """Grids that take part: a quarter, half, once and 1.6 times the nodes that `run` has by default."""
+    """Sizes of the grids: a quarter, half, once and 1.6 times the nodes along the longest axis of `run`'s default."""
     default = along_longest(specs_over(scene))
     return sorted({max(4, round(default * share)) for share in (0.25, 0.5, 1.0, 1.6)})
 
@@ -70,14 +70,14 @@ def bench(
     default: tuple[int | None, int | None] = (None, None),
     studio: Studio | None = None,
 ) -> Report:
-    """Race all contestants on a scene for `budget` seconds, from warm kernels on.
+    """Race all contestants on a scene for `budget` seconds, after compilation.
 
-    `default` are the nodes and paths that are marked as the default of `run`, None where it chooses them; `studio`
-    takes pictures, for the difference that an eye would see. A budget that is not positive or a scene without surface
-    or light raises BadInput.
+    `default` are the nodes and paths that are marked as the default of `run`, None where `run` chooses them; `studio`
+    draws pictures to measure the visible difference. A budget that is not positive or above `LONGEST`, or a scene
+    without surface or light, raises BadInput.
     """
     if not 0 < budget <= LONGEST:
-        raise BadInput(f"a budget of {budget:g} seconds was asked for; expected up to {LONGEST:g}, such as 60")
+        raise BadInput(f"got a budget of {budget:g} seconds; expected more than 0 and up to {LONGEST:g}, such as 60")
     auto = prepare(registry.backend("auto"), scene)
     light_left_out(scene, auto, 0)  # compiles
     begun, racing, before_parts = time.perf_counter(), (1 - 0.7 * REFERENCES - PARTS) * budget, (1 - PARTS) * budget
@@ -106,7 +106,7 @@ def bench(
         raise BadInput("no contestant could finish; " + "; ".join(notes + race.notes))
     race.repeat(begun + racing, report, flip)
     _sharpen(references, {surface: race.least(surface) / 5 for surface in references}, before_parts - report())
-    race.repeat(begun + before_parts, report, flip)  # what the references did not need goes into missing seeds
+    race.repeat(begun + before_parts, report, flip)  # time that the references left over goes to missing seeds
     parts = measure_parts(scene, auto, sizes(scene), bounces, seed, budget - report(), pace)
     shown = tuple(front(race.points, references))
     notes += [*race.notes, *_remarks(race, shown)]
@@ -114,8 +114,8 @@ def bench(
 
 
 def _unseen(scene: Scene, budget: float, seed: int) -> Queries:
-    """Points of the references: as many level sets as a small share of the budget allows, of 40 to 100 points."""
-    for points in (8, 64):  # the first one loads what extracts surfaces
+    """Points of the references: on as many level sets as a small share of the budget allows, 83 to 150 on each."""
+    for points in (8, 64):  # the first call loads what extracts surfaces
         begun = time.perf_counter()
         unseen_on_level_sets(scene, 1, points, seed)
         one = time.perf_counter() - begun
@@ -127,7 +127,7 @@ def _unseen(scene: Scene, budget: float, seed: int) -> Queries:
 
 
 def _tracer_of(entrants: Sequence[Method], surface: str) -> Tracer:
-    """The fastest tracer of a surface that computes its reference: a plugin's only where the package has none."""
+    """The fastest tracer of a surface, for its reference: a plugin's only if the package has none."""
     own = {m: registry.entry("backend", m.backend.name).package == "illumgrid" for m in entrants}
     return min((m for m in entrants if m.surface == surface), key=lambda m: (not own[m], m.slow)).tracer
 
@@ -135,7 +135,7 @@ def _tracer_of(entrants: Sequence[Method], surface: str) -> Tracer:
 def _references(
     scene: Scene, entrants: Sequence[Method], asked: Queries, budget: float, seed: int, notes: list[str]
 ) -> tuple[dict[str, Reference], float]:
-    """References by surface, level sets first, with 64 paths; and seconds for a path of the first."""
+    """References by surface, level sets first, with 64 paths; and the seconds per path of the first."""
     found: dict[str, Reference] = {}
     pace = 0.0
     surfaces, rows = sorted({method.surface for method in entrants}), np.unique(asked.level, axis=0)
@@ -143,7 +143,7 @@ def _references(
     most, _ = enough_bounces(scene, _tracer_of(entrants, surfaces[0]), seed, 2e-4)
     for surface in surfaces:
         tracer, begun = _tracer_of(entrants, surface), time.perf_counter()
-        begin(tracer, one, most, seed)  # meshes may take longer to build than rays to cast: try one level set
+        begin(tracer, one, most, seed)  # building meshes may take longer than tracing: try one level set
         takes = (time.perf_counter() - begun) * len(rows)
         if found and takes > OTHER * budget:
             notes.append(f"backends of the {surface} do not compete: their reference would take {takes:.0f} s")
@@ -158,7 +158,7 @@ def _references(
 
 
 def _thinned(reference: Reference, spent: float, left: float, seed: int) -> Reference:
-    """As many points of a reference, which took so many seconds, as can be sharpened to GOAL in the time left."""
+    """As many points of a reference as can reach an error of `GOAL` in the time `left`, if all took `spent` seconds."""
     takes = spent * (reference.error / GOAL) ** 2
     keep = int(np.clip(len(reference) * left / max(takes, 1e-9), min(FEWEST, len(reference)), len(reference)))
     chosen = np.sort(np.random.default_rng((seed, 4)).permutation(len(reference))[:keep])
@@ -166,7 +166,7 @@ def _thinned(reference: Reference, spent: float, left: float, seed: int) -> Refe
 
 
 def _sharpen(references: dict[str, Reference], error: dict[str, float], left: float) -> None:
-    """Walk more paths until the own errors are small enough or the time is over; the main reference comes last."""
+    """Trace more paths until the references' own errors are small enough or the time is over, the main one last."""
     end = time.perf_counter() + left
     for rest, surface in zip(range(len(references), 0, -1), reversed(list(references))):
         now = time.perf_counter()
@@ -174,9 +174,9 @@ def _sharpen(references: dict[str, Reference], error: dict[str, float], left: fl
 
 
 def _show_default(race: Race, grid: int | None, paths: int | None, budget: float, pace: float) -> list[str]:
-    """Chart `run`'s default; if it would take too much of the budget, predict it and others, or leave it out.
+    """Add `run`'s default to the chart; if it would take too much of the budget, predict it and others, or omit it.
 
-    `pace` are seconds for a path.
+    `pace` is in seconds per path.
     """
     scene, own = race.scene, ("levelset", Direct(), registry.auto_backend())
     able = (m for m in race.methods if (m.surface, m.sampler, m.backend.name) == own and Nearest() in m.interpolators)
@@ -198,14 +198,14 @@ def _show_default(race: Race, grid: int | None, paths: int | None, budget: float
         return pace * count * nodes_to_light(scene, lattice(specs, plain.tracer, race.bounces))
 
     base = specs_over(scene, grid, BASE if looked else DENSITY)
-    look = seconds(base, 2 * LOOKED) if looked else 0.0  # of twice the bounces
+    look = seconds(base, 2 * LOOKED) if looked else 0.0  # it follows twice the bounces
     if look > DEFAULT * budget:
         return [f"run's default does not compete: its first look would take about {look:.0f} s"]
     if not looked:
         paths = paths or PATHS
-        if len({max(spec.shape) for spec in base}) == 1:  # else fields of different size, each with its own default
+        if len({max(spec.shape) for spec in base}) == 1:  # else fields differ in size, each with its own default
             grid = along_longest(base)
-    # The nodes that a look chooses have as many paths and more to fill.
+    # The chosen nodes take as many paths as the look, and longer to fill: together three times the look.
     if (3 * look or seconds(base, paths or PATHS)) <= DEFAULT * budget:
         race.show_default(method, filler, grid, paths)
         return []
@@ -224,7 +224,7 @@ def measure_parts(
 ) -> list[Measured]:
     """Parts of the error on grids of these sizes, until `seconds` are used; `path` is the measured time per path.
 
-    At as many points as half of the time allows: where a few of them carry the error, few points miss those.
+    Uses as many points as half of the time allows: where a few of them carry the error, a small number misses those.
     """
     begun, last = time.perf_counter(), 0.0
     each = path * (2 * 8 * sum(PARTS_PATHS) * len(sizes) + 2 * PARTS_REFERENCE)
@@ -240,13 +240,13 @@ def measure_parts(
 
 
 def _remarks(race: Race, best: Sequence[Point]) -> list[str]:
-    """What a reader of the chart must know about how certain it is."""
+    """Remarks for the reader on the uncertainty of the chart."""
     found = [
-        f"the reference of the {surface} has an error of {reference.error:.2%}, more than a fifth of the smallest that "
-        f"it judges, {least:.2%}; its variance is subtracted, and a larger budget sharpens it"
+        f"the reference of the {surface} has an error of {reference.error:.2%}, more than a fifth of the smallest "
+        f"error measured by it, {least:.2%}; its variance is subtracted, and a larger budget reduces it"
         for surface, reference in race.references.items()
         if reference.error > (least := race.least(surface)) / 5
     ]
     if few := sum(len(p.seconds) < SEEDS for p in best):
-        found.append(f"{few} points of the front were run with fewer than {SEEDS} seeds: the budget was over")
+        found.append(f"{few} points of the front were run with fewer than {SEEDS} seeds: the budget was used up")
     return found

@@ -1,4 +1,4 @@
-"""What can be compared: every sampler with every backend and every interpolator that is available here."""
+"""The methods to compare: every available sampler with every backend and every interpolator."""
 
 import time
 from collections.abc import Sequence
@@ -19,15 +19,15 @@ SLOWEST = 0.005  # share of the budget that a backend may take for 64 queries an
 
 @dataclass(frozen=True, eq=False)
 class Method:
-    """A way to make samples, and all that may fill the grid from them."""
+    """A sampler with a backend, and the interpolators that may fill the grid from their samples."""
 
     sampler: Any  # a Sampler, once it is known
     backend: Backend
     tracer: Tracer
-    surface: str  # what stands for the level sets: "levelset" or "mesh"
+    surface: str  # representation of the level sets: "levelset" or "mesh"
     interpolators: tuple[Interpolator, ...]
     denser: "Method | None" = None  # the same with more level sets, tried after this one
-    slow: float = 1.0  # what the backend takes, over what the fastest one takes
+    slow: float = 1.0  # time of the backend over that of the fastest one
     looked: bool = False  # whether a first look chooses the nodes, as `run` does under a sky
 
     def label(self, interpolator: Any) -> str:
@@ -42,7 +42,7 @@ class Method:
 
 
 def tracers(scene: Scene, asked: Queries, budget: float) -> tuple[list[Method], list[str]]:
-    """Backends on each of their surfaces, as warm methods that lack a sampler, and why others are left out."""
+    """Methods without a sampler, one per backend and surface, already compiled; and why other backends are omitted."""
     found, notes = [], []
     few = asked[: min(64, len(asked))]
     few = few[np.flatnonzero((few.level == few.level[0]).all(axis=1))]  # a mesh is made for each level set
@@ -52,10 +52,10 @@ def tracers(scene: Scene, asked: Queries, budget: float) -> tuple[list[Method], 
             continue
         try:
             tracer = prepare(backend, scene)
-            for some in (few[:1], few):  # compiled and built in the first
+            for some in (few[:1], few):  # the first call compiles and builds
                 begun = time.perf_counter()
                 tracer.solve(some, paths=range(4), bounces=2, seed=0)
-        except Exception as reason:  # a stranger's backend ends its own race only
+        except Exception as reason:  # if a plugin's backend fails, the others go on
             notes.append(f"{backend.name} does not compete: {reason or type(reason).__name__}")
             continue
         spent = (time.perf_counter() - begun) * 64 / len(few)
@@ -67,7 +67,7 @@ def tracers(scene: Scene, asked: Queries, budget: float) -> tuple[list[Method], 
 
 
 def methods(tracers: Sequence[Method]) -> list[Method]:
-    """Every sampler and interpolator with each of the `tracers`, with the fewest level sets each."""
+    """Every sampler and interpolator with each of the `tracers`; each method begins with the fewest level sets."""
     found = []
     interpolators = tuple(registry.available("interpolator"))
     for sampler in registry.available("sampler"):

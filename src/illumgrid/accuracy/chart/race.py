@@ -26,27 +26,27 @@ from illumgrid.stages import Interpolator
 STEPS = (8, 32, 128, 512, 2048)  # paths; `run`'s default is one of them
 SEEDS = 3
 
-Flip = Callable[[list[IlluminationGrid]], float]  # how different a picture of grids looks from the converged one
+Flip = Callable[[list[IlluminationGrid]], float]  # visible difference of a picture of grids from the converged one
 
 
 @dataclass(eq=False)
 class Point:
-    """A method with an interpolator at one setting: a point of the chart, run once for each seed."""
+    """A method with an interpolator at one setting: a point of the chart, with one run per seed."""
 
     method: Method
     interpolator: Interpolator
-    grid: int | None  # nodes along the longest axis of every field; None: of each as many as `run` has by default
+    grid: int | None  # nodes along the longest axis of every field; None: the default of `run`
     paths: int
     queries: int
     covered: NDArray[np.bool_]  # (n,) points that read only nodes with light of their own
-    longest: int = 0  # nodes along the longest axis of all
+    longest: int = 0  # nodes along the longest axis of all fields
     seconds: list[float] = field(default_factory=list)  # one per seed: sampler, backend and interpolator
-    filling: float = 0.0  # of those of the first seed, what the interpolator took
-    light: list[Floats] = field(default_factory=list)  # one per seed, (n, 3): what the grids hold at the points
-    memory: float | None = None  # megabytes by which the process grew at most, in one run; known on Linux
+    filling: float = 0.0  # of the seconds of the first seed, those of the interpolator
+    light: list[Floats] = field(default_factory=list)  # one per seed, (n, 3): light of the grids at the points
+    memory: float | None = None  # largest growth of the process in one run, in megabytes; on Linux only
     flip: float | None = None  # of a picture at an unseen isovalue
-    default: bool = False  # whether it is what `run` does when nothing is asked for
-    built: bool = True  # or only the nodes around the points were lit, and `seconds` are predicted
+    default: bool = False  # whether it is the default of `run`
+    built: bool = True  # else only nodes around the points were lit, and `seconds` are predicted
 
     @property
     def time(self) -> float:
@@ -59,9 +59,9 @@ class Point:
 
 
 class Run:
-    """A method on one size of grid with one seed, which goes on with more paths: earlier ones are kept.
+    """A method on one size of grid with one seed, to which more paths are added step by step.
 
-    In a race it is a contestant, which says what its next step costs and how promising it is.
+    In a race it is a contestant, with the cost of its next step and a measure of how promising it is.
     """
 
     def __init__(self, scene: Scene, method: Method, grid: int | None, bounces: int, seed: int) -> None:
@@ -72,11 +72,11 @@ class Run:
         self.bake = Bake.of([], bounces, seed)
         self.asking = self.tracing = 0.0
         self.interpolators = method.interpolators
-        self.step = 0  # of STEPS, the next one; beyond them, or none, where it has come to its end
+        self.step = 0  # index into STEPS of the next step; beyond them, or none, at the end
         self.cost = 0.0  # of that step, predicted
-        # Until it has run, a slow backend counts as off the front by its slowness.
-        self.factor = method.slow  # what the slowdown of `ranked_by` is multiplied by
-        self.ranked_by: Sequence[Point] = ()  # its own last points, or at first those of the one that it came from
+        # Until it has run, a slow backend counts as behind the front by its slowness.
+        self.factor = method.slow  # on the slowdown of `ranked_by`
+        self.ranked_by: Sequence[Point] = ()  # its own last points; at first those of the run that it derives from
 
     def look(self) -> Ahead:
         """Take the first look of a method that has one."""
@@ -85,7 +85,7 @@ class Run:
         return self.ahead
 
     def go_on(self, paths: int | None) -> None:
-        """Trace until each query has so many paths, by default as many as `run` takes after a first look."""
+        """Trace until each query has this many paths, by default as many as `run` takes after a first look."""
         begun = time.perf_counter()
         if not self.bake.targets:
             ahead = self.look()
@@ -118,7 +118,7 @@ def front(points: Iterable[Point], references: dict[str, Reference]) -> list[Poi
 
 def slowdown(point: Point, error: dict[Point, float]) -> float:
     """Relative to the front: time ratio at equal error, or squared-error ratio at equal time, whichever is larger."""
-    own = error[point]  # squared, for noise halves with four times the paths
+    own = error[point]  # its ratio is squared, as noise halves with four times the paths
     least = min(e for p, e in error.items() if p.time <= 1.05 * point.time)
     quick = min(p.time for p, e in error.items() if e <= 1.05 * own)
     return float(max(1.0, (own / least) ** 2, point.time / quick))
@@ -126,7 +126,7 @@ def slowdown(point: Point, error: dict[Point, float]) -> float:
 
 @dataclass(eq=False)
 class Race:
-    """Methods on grids of `sizes`, coarse to fine, advanced one step at a time; references by surface judge them."""
+    """Methods on grids of `sizes`, coarse to fine, advanced step by step; each surface has a reference."""
 
     scene: Scene
     references: dict[str, Reference]
@@ -138,7 +138,7 @@ class Race:
     notes: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        # The first shows what the others will cost: one that builds no meshes.
+        # The first predicts the cost of the others: it should build no meshes.
         ordered = sorted(self.methods, key=lambda m: (m.surface != "levelset", m.slow))
         self.contestants = [self._run(method, self.sizes[0]) for method in ordered]
 
@@ -146,7 +146,7 @@ class Race:
         return Run(self.scene, method, grid, self.bounces, shifted_seed(self.seed, again))
 
     def show_default(self, method: Method, filler: Interpolator, grid: int | None, paths: int | None) -> None:
-        """Chart what `run` does when nothing is asked for, before all others; it goes on from there."""
+        """Add the default of `run` to the chart before all others, and to the contestants from there on."""
         run = self._run(method, grid)
         run.go_on(paths)
         point, _ = self._point(run, filler)
@@ -159,9 +159,9 @@ class Race:
     def predict(
         self, method: Method, filler: Interpolator, grid: int | None, paths: int | None, default: bool = False
     ) -> None:
-        """Chart a run by the nodes around the points, which hold what they would in all of it; one seed after a look.
+        """Add a run to the chart, of which only the nodes around the points are lit, as the whole run would light them.
 
-        Its seconds are predicted from what these nodes take.
+        Its seconds are predicted from those of these nodes. After a first look there is one seed only.
         """
         run, begun = self._run(method, grid), time.perf_counter()
         ahead, reference = run.look(), self.references[method.surface]
@@ -176,7 +176,7 @@ class Race:
         self.points.append(replace(point, seconds=[takes] * len(seeds), light=[light for light, _ in found]))
 
     def advance(self, run: Run) -> None:
-        """Take the next step of a contestant, and fill the grid by every interpolator."""
+        """Take the next step of a contestant, and fill the grid by each of its interpolators."""
         paths, begun = STEPS[run.step], time.perf_counter()
         same = [p for p in self.points if (p.method, p.grid, p.paths) == (run.method, run.grid, paths)]
         known = {p.interpolator: p for p in same if p.built}
@@ -189,16 +189,16 @@ class Race:
             return
         spent = time.perf_counter() - begun
         for other in self.contestants:
-            if other.cost == 0.0:  # nobody has run before this one
+            if other.cost == 0.0:  # no contestant has run before
                 other.cost = spent * other.method.slow / run.method.slow
-        self.points = [p for p in self.points if p.built or p not in same]  # built is better than predicted
+        self.points = [p for p in self.points if p.built or p not in same]  # built ones replace predicted ones
         self.points += [p for p in new if p.interpolator not in known]
         self._rank(run, new)
         self._foresee(run, sum(p.filling for p in new if p.interpolator in run.interpolators))
         self._unlock(run, spent)
 
     def _rank(self, run: Run, new: list[Point]) -> None:
-        """Compare new points with the front: drop interpolators that hold the others up, and end what has converged."""
+        """Compare new points with the front: drop slow interpolators, and end a run that has converged."""
         reference, paths = self.references[run.method.surface], STEPS[run.step]
         before = [p for p in run.ranked_by if p.grid == run.grid and p.paths < paths]
         now, then = (min((p.rmse(reference) for p in points), default=np.inf) for points in (new, before))
@@ -210,16 +210,16 @@ class Race:
         )
 
     def _foresee(self, run: Run, filling: float) -> None:
-        """Predict the cost of a next step, whose paths beyond those so far take as long as these, each."""
+        """Predict the cost of the next step: each additional path takes as long as one so far."""
         if run.step < len(STEPS):
             run.cost = run.tracing * (STEPS[run.step] / run.bake.paths - 1) + filling
 
     def _unlock(self, run: Run, spent: float) -> None:
-        """After a first step, enter the next finer grid, and on the coarsest more level sets."""
+        """After a first step, add contestants: the next finer grid and, on the coarsest, more level sets."""
         entering = []  # method, grid, cost of its first step and factor of its slowdown
         if run.grid in self.sizes and run.grid != self.sizes[-1]:
             finer = next(size for size in self.sizes if size > run.longest)
-            # Twice the nodes may halve the error, for which noise would need four times the paths: so much sooner.
+            # Twice the nodes may halve the error, for which noise would need four times the paths: hence the factor.
             more = finer / run.longest
             entering.append((run.method, finer, spent * more**3, 1 / more**2))
         if run.method.denser and run.grid == self.sizes[0]:
@@ -242,18 +242,18 @@ class Race:
         return {p: max(1e-9, p.rmse(self.references[p.method.surface])) for p in self.points}
 
     def least(self, surface: str) -> float:
-        """Smallest error that the reference of a surface judges."""
+        """Smallest error measured against the reference of a surface."""
         own = (p.rmse(self.references[surface]) for p in self.points if p.method.surface == surface)
         return min(own, default=np.inf)
 
     def _slowdown(self, run: Run, standing: dict[Point, float]) -> float:
-        """How far behind the front a contestant is to be expected."""
+        """Expected slowdown of a contestant, relative to the front."""
         return run.factor * min((slowdown(p, standing) for p in run.ranked_by), default=1.0)
 
     def next(self, left: float) -> Run | None:
-        """The contestant to advance: least predicted time, times its slowdown; None if the rest is too costly.
+        """The contestant with the least product of predicted time and slowdown; None if all are too costly.
 
-        What the seeds will cost that the front still lacks is kept back.
+        Time is reserved for the seeds that the front still lacks.
         """
         kept = 1.1 * (SEEDS - 1) * sum(seconds for seconds, _ in self.missing_seeds())
         able = (c for c in self.contestants if c.step < len(STEPS) and (kept + SEEDS * c.cost < left or c.cost == 0.0))
@@ -261,7 +261,7 @@ class Race:
         return min(able, key=lambda c: (c.cost * self._slowdown(c, standing), c.longest), default=None)
 
     def missing_seeds(self) -> list[tuple[float, list[Point]]]:
-        """Points of the front that lack seeds, by method and grid, and what one seed more of them takes, in seconds."""
+        """Points of the front that lack seeds, by method and grid, and the seconds that one more seed takes."""
         groups: dict[tuple[Method, int | None], list[Point]] = {}
         for p in front(self.points, self.references):
             if p.built and len(p.seconds) < SEEDS:
@@ -269,7 +269,7 @@ class Race:
         return [(max(p.time - p.filling for p in g) + sum(p.filling for p in g), g) for g in groups.values()]
 
     def repeat(self, deadline: float, report: Callable[[], object], flip: Flip | None = None) -> None:
-        """Run the front's points with other seeds, until every one of them has enough."""
+        """Run the points of the front with other seeds, until each has `SEEDS` or the deadline is too near."""
         while missing := self.missing_seeds():
             seconds, points = min(missing, key=lambda found: found[0])
             if time.perf_counter() + seconds > deadline:
@@ -288,7 +288,7 @@ class Race:
 
 
 def resident(reset: bool = False) -> float | None:
-    """Megabytes that the process held at most since the last reset; None where the system does not say."""
+    """Peak resident memory of the process in megabytes, since the last reset; None if the system does not report it."""
     try:
         if reset:
             Path("/proc/self/clear_refs").write_text("5")

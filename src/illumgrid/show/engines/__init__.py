@@ -43,10 +43,10 @@ def choose_engine(name: str) -> tuple[str, str]:
         return "software", f"{' and '.join(reasons)}; apt-get install {' '.join(gl.PACKAGES.values())} brings OpenGL"
     if gl.elsewhere():
         raise BadInput(
-            f"the engine {name} was asked for, but {gl.elsewhere()}; expected all pictures in one thread; draw there "
+            f"the engine {name} was requested, but {gl.elsewhere()}; expected all pictures in one thread; draw there "
             "or choose --engine software"
         )
     raise BadInput(
-        f"the engine {name} was asked for, but there is {reasons[0]}; install it (apt-get install {gl.PACKAGES[name]} "
+        f"the engine {name} was requested, but there is {reasons[0]}; install it (apt-get install {gl.PACKAGES[name]} "
         "on Debian and Ubuntu) or choose --engine software"
     )
