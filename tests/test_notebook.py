@@ -117,10 +117,10 @@ def test_a_view_is_coarse_at_once_and_asks_for_the_rest_as_it_comes(browser, gat
 
     page, troubles = shown(browser, job.view, ask)
     subtitle = "document.querySelector('#here > div').shadowRoot.querySelector('[data-part=subtitle]').textContent"
-    until(page, f"{subtitle}.includes(' of the light is there')")
+    until(page, f"{subtitle}.includes(' of the light is computed')")
     gate.set()
     light = job.wait()
-    until(page, f"{subtitle}.startsWith('All light is there. Show it again')")
+    until(page, f"{subtitle}.startsWith('The light is complete. Show it again')")
     assert not troubles and "since=" in asked[0] and "sweep=0.5" in asked[0]
     page.close()
     whole = ig.run(scene, **few, judge=False)

@@ -5,7 +5,7 @@ export const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * 
 export const sum = (...terms) => [0, 1, 2].map((k) => terms.reduce((s, [w, v]) => s + w * v[k], 0));
 const unit = (v) => sum([1 / Math.hypot(...v), v]);
 
-const STEEPEST = 1.5533; // 89 degrees: at the pole there is no right and left
+const STEEPEST = 1.5533; // 89 degrees: at the poles right and left are undefined
 
 // Right, up and forward of a view; `axes` are the world's right, front and up.
 export function facing({ azimuth, elevation }, axes) {
@@ -20,7 +20,7 @@ export function eyeOf(view, axes) {
   return sum([1, view.target], [-view.distance, facing(view, axes).forward]);
 }
 
-// The nearest place from which the outline fits the picture: each point bounds the eye on either side.
+// The nearest view in which the outline fits the picture: each of its points bounds the eye's place on either side.
 export function fitted(opening, axes, aspect, tangent) {
   const { right, up, forward } = facing(opening, axes);
   const points = opening.outline.map((p) => [dot(p, right), dot(p, up), dot(p, forward)]);

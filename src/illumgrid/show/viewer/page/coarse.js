@@ -1,8 +1,8 @@
-// Light that is still to come: there is `every` so many'th texel along each axis, and straight lines are between them.
+// Light before it is complete: one in `every` texels along each axis is known, and light is linear between them.
 
 import { HALVES, lightTexels } from "./numbers.js";
 
-// To half floats, from numbers that they hold; those below the least normal one become 0.
+// Rounds numbers within the range of half floats to these; those below the least normal one become 0.
 function halves(values) {
   const bits = new Uint32Array(values.buffer), result = new Uint16Array(values.length);
   for (let i = 0; i < bits.length; i++) {
@@ -12,7 +12,7 @@ function halves(values) {
   return result;
 }
 
-// From texels of a coarse lattice, of so many halves, to those of a fine one, in straight lines; beyond its last node, as there.
+// Interpolates linearly from texels of a coarse lattice, of `each` half floats, to those of a fine one; constant beyond the last node.
 function between(texels, each, coarse, fine, every) {
   let values = Float32Array.from(texels, (h) => HALVES[h]), inner = each;
   for (let axis = 0; axis < 3; axis++) {

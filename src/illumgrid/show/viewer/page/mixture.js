@@ -1,4 +1,4 @@
-// Light mixed from its layers, or from the answers to a sky, on the graphics card: once when they change, not in every pixel.
+// Mixes light on the graphics card, from layers or responses to a sky: once per change, not in every pixel.
 
 import { heldTexels, lightParts } from "./numbers.js";
 import { set } from "./programs.js";
@@ -27,7 +27,7 @@ export class Mixture {
     this.places = picture.volume(gl.R32UI, gl.RED_INTEGER, gl.UNSIGNED_INT, about.shape, places, gl.NEAREST);
   }
 
-  // Into the texture of light, slice by slice.
+  // Draws into the texture of light, slice by slice.
   draw(weights, sky) {
     const { picture, about, textures } = this, { gl, mixProgram } = picture, [nx, ny, nz] = about.shape;
     const shares = this.parts.flatMap((part) => part.shares(weights, sky));
@@ -37,7 +37,7 @@ export class Mixture {
     gl.disable(gl.DEPTH_TEST);
     gl.disable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE);
-    gl.colorMask(true, about.channels > 1, true, false); // the error stays
+    gl.colorMask(true, about.channels > 1, true, false); // keeps the error
     set(gl, mixProgram, {
       uPlaces: picture.bind(AT_ONCE, gl.TEXTURE_3D, this.places ?? null), uSome: this.places ? 1 : 0, uShape: [nx, ny],
       uForward: [0, 0, 1], uRight: [1, 0, 0], uUp: [0, 1, 0],
@@ -54,6 +54,6 @@ export class Mixture {
       }
     }
     gl.colorMask(true, true, true, true);
-    picture.bind(AT_ONCE, gl.TEXTURE_3D, null); // whole numbers, which no other program takes there
+    picture.bind(AT_ONCE, gl.TEXTURE_3D, null); // integers, which no other program reads there
   }
 }

@@ -53,15 +53,15 @@ export const HALVES = Float32Array.from({ length: 65536 }, (_, h) => {
   return h & 32768 ? -size : size;
 });
 
-// Texels that hold the parts from which light is mixed: those that are lit, where only they are held, else all.
+// Texels for which parts of a mixture are stored: the lit ones if a mask names them, else all.
 export function heldTexels(bytes, about) {
   const count = about.shape[0] * about.shape[1] * about.shape[2], held = [];
   for (let i = 0; i < count; i++) if (about.mask === undefined || (bytes[about.mask + (i >> 3)] >> (i & 7)) & 1) held.push(i);
   return held;
 }
 
-// The parts of which light is the weighted sum, as `mix.frag` takes them: a function of the weights of the lights and of
-// the coefficients of the sky to what each part adds to the channels, and one that puts its values into every fourth place of an array.
+// The parts whose weighted sum is the light, as in `mix.frag`. For each, `shares` gives its weights in the channels, from
+// the weights of the lights and the coefficients of the sky; `put` writes its values to every fourth place of an array.
 export function lightParts(bytes, about, held) {
   const { channels, shape } = about, count = shape[0] * shape[1] * shape[2], picked = about.mask === undefined ? null : held;
   const halves = (offset, many, which) => (into, from) => {
@@ -84,7 +84,7 @@ export function lightParts(bytes, about, held) {
   return [...layers, ...answers];
 }
 
-// Exposed light of the faces of a field's box, 18 numbers, with its lights at these weights or under a sky with these coefficients.
+// Exposed light of the six faces of a field's box, 18 numbers, for these weights of the lights or coefficients of the sky.
 export function capLight({ shown, layers, sky, rest }, weights, turned) {
   const mixed = (face, k) => {
     if (layers.length) return layers.reduce((sum, layer, j) => sum + weights[j] * layer[face][k], 0);
@@ -93,8 +93,8 @@ export function capLight({ shown, layers, sky, rest }, weights, turned) {
   return shown.flatMap((color, face) => color.map((known, k) => (known < 0 ? -1 : Math.max(0, mixed(face, k)))));
 }
 
-// Images of the sky, at the weights of their lights, as texels (radiance, sum up to this one of what is asked for), and
-// the mean colour `soft` above which it is: some times that of the whole.
+// Images of the sky at the weights of their lights, as texels: radiance, and the sum up to each texel of the excess above
+// `soft`, which rays aim at. `soft` is BRIGHT times the mean colour of the sky.
 const BRIGHT = 4;
 export function skyTexels(bytes, [width, height], images) {
   const texels = new Float32Array(4 * width * height), cosines = Float64Array.from({ length: height }, (_, j) => Math.cos(Math.PI * (0.5 - (j + 0.5) / height)));

@@ -1,4 +1,4 @@
-// Draws one picture: layers of fields and walls, summed over places within the pixel, then shown.
+// Draws one picture: layers of fields and walls, averaged over positions within the pixel.
 
 import { coarseTexels } from "./coarse.js";
 import { bricks, capLight, fieldValues, lightTexels } from "./numbers.js";
@@ -20,7 +20,7 @@ export class Picture {
     this.gl = gl;
     this.single = gl.getExtension("EXT_color_buffer_float");
     if (!this.single && !gl.getExtension("EXT_color_buffer_half_float")) {
-      throw new Error("This page sums light in floating point, which this graphics driver cannot draw into.");
+      throw new Error("This page draws into floating-point textures, which this graphics driver does not support.");
     }
     const largest = gl.getParameter(gl.MAX_3D_TEXTURE_SIZE);
     const sides = scene.fields.flatMap((f) => [...f.values.shape, ...f.light.shape]).concat(scene.atlas?.shape ?? []);
@@ -73,7 +73,7 @@ export class Picture {
     return this.volume(format, layout, gl.HALF_FLOAT, about.shape, about.every ? coarseTexels(data, about) : lightTexels(data, about), gl.LINEAR);
   }
 
-  // Light of fields and walls under other weights, or the turned sky; until they change, it is the stored one.
+  // Mixes the light of fields and walls for other weights or a turned sky; until these change, it is the stored light.
   mix({ weights, turn }) {
     if (!this.data || this.mixed === String([weights, turn])) return;
     this.mixed = String([weights, turn]);
@@ -83,7 +83,7 @@ export class Picture {
     for (const mixture of this.mixtures) mixture.draw(weights, this.turned);
   }
 
-  // A place to draw into: colours of these formats, half floats as a rule, and a depth that can be read back.
+  // A render target: colours of these formats, by default half floats, and a depth that can be read back.
   target(width, height, withDepth, formats = [this.gl.RGBA16F]) {
     const gl = this.gl, made = { frame: gl.createFramebuffer() };
     gl.bindFramebuffer(gl.FRAMEBUFFER, made.frame);
@@ -198,19 +198,19 @@ export class Picture {
     };
   }
 
-  // Whether surfaces are seen through.
+  // Whether any surface is translucent.
   through({ look, trust }) {
     return !trust && (look === "translucent" || this.scene.fields.some((field) => field.through > 0));
   }
 
-  // The clip plane on the stage: of the axes x, y, z, then those from the other side, at a place from 0 to 1.
+  // The clip plane in stage coordinates, at a place from 0 to 1: `axis` 0 to 2 cuts beyond x, y, z, and 3 to 5 before.
   clip({ clip: [axis, at] }) {
     if (axis < 0) return [0, 0, 0, 1];
     const { low, high } = this.scene.clip, k = axis % 3, sign = axis < 3 ? 1 : -1;
     return [0, 1, 2].map((j) => (j === k ? sign : 0)).concat(sign * ((1 - at) * low[k] + at * high[k]));
   }
 
-  // Isovalue of a field at this place of the sweep, upwards.
+  // Isovalue of a field at this position of the sweep; its sign is such that the solid has larger values.
   level(field, sweep) {
     return field.upward * isovalueOf(field, sweep);
   }
@@ -228,7 +228,7 @@ export class Picture {
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 
-  // The camera, at a place (0 to 1) within the pixels.
+  // The camera, for a position (0 to 1) within the pixel.
   seen({ view }, width, height, place) {
     const { scene } = this, { right, up, forward } = facing(view, scene.axes);
     const tall = scene.tangent, wide = (tall * width) / height;
@@ -240,8 +240,8 @@ export class Picture {
     };
   }
 
-  // Add one sample to the mean of `count` before it, at a place within the pixel; `width` x `height` in all. Into `raw`,
-  // if it is given, goes what the tone curve has not seen: light, or if `base` the colours of a second quantity alone.
+  // Adds one sample, at a position within the pixel, to the mean of `count` before it. If `raw` is given, it gets the light
+  // before the tone curve, or with `base` the colours of a second quantity alone.
   sample(state, width, height, place, count, raw = null, base = false) {
     const gl = this.gl, { scene } = this;
     this.resize(width, height);
@@ -279,7 +279,7 @@ export class Picture {
     this.copy(this.mean, null, null, true);
   }
 
-  // Wait for the graphics card, so that the time of a frame can be measured.
+  // Waits for the graphics card, so that the time of a frame can be measured.
   wait() {
     const gl = this.gl;
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.mean.frame);

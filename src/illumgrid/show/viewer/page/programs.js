@@ -1,4 +1,4 @@
-// Shaders made ready, and the values that they are given.
+// Compiles shaders and sets their uniforms.
 
 export function program(gl, vertex, fragment) {
   const built = gl.createProgram();

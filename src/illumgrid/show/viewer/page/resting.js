@@ -1,6 +1,6 @@
-// While nothing moves, rays from every pixel gather light; see gather.glsl. A ray ends where it meets a surface, in the
-// light that is stored there, so that few suffice; where that is not to be trusted, or near, it is reflected once more.
-// Until there are enough rays, the picture is mostly that of the lookup.
+// While nothing moves, rays from every pixel gather light; see gather.glsl. A ray ends at the
+// surface that it hits, in the light stored there, so that few suffice; where that light is unreliable or the surface
+// near, it is reflected once more. Until there are enough rays, the picture is mostly that of the lookup.
 
 import { dot, sum } from "./camera.js";
 import { skyTexels } from "./numbers.js";
@@ -8,28 +8,28 @@ import { LOOKS } from "./picture.js";
 import { program, set } from "./programs.js";
 import { skyTurned } from "./skies.js";
 
-export const PLACES = [[0.25, 0.25], [0.75, 0.75], [0.75, 0.25], [0.25, 0.75]].concat( // within the pixel, as in a still picture of the package, then between
+export const PLACES = [[0.25, 0.25], [0.75, 0.75], [0.75, 0.25], [0.25, 0.75]].concat( // within the pixel: the four of a still picture, then others between
   [...Array(12).keys()].map((k) => [(0.5 + 0.7548776 * (k + 1)) % 1, (0.5 + 0.5698403 * (k + 1)) % 1]),
 );
 const MOST = 4096; // rays from each pixel
 const FINE = 1 / 500; // standard error, in display radiance, at which the picture is done
 const TRIAL = [96, 72], RAYS = 8; // pixels, and rays from each in either half of a trial
-const ENOUGH = 64; // pixels on which a surface is judged by itself
-const BAND = 30; // milliseconds for a part of a slow picture
+const ENOUGH = 64; // pixels from which a surface gets weights of its own
+const BAND = 30; // milliseconds per band of a slow picture
 const FAR = 100;
 const ALIKE = 0.3; // as in illumgrid.grid.cache
 const OPEN = 0, DISC = 1, LAMP = 2, MIRROR = 3, IMAGE = 4;
 const ROBERTS_2 = [0.7548776662466927, 0.5698402909980532], ROBERTS_4 = [0.8566748838545029, 0.6287067210378087]; // Roberts' sequences of two and four dimensions
 const SHINY = 0.35; // roughness of the shiny look
 
-// Sum of variances, the few that are far above the others taken for FAR times their median.
+// Sum of variances, each limited to FAR times the median.
 function usualOf(known) {
   const most = FAR * (known.sort((a, b) => a - b)[known.length >> 1] || Infinity);
   return known.reduce((total, x) => total + Math.min(x, most), 0);
 }
 
 export class Resting {
-  // Null where the page cannot: light that it holds no description of, or a graphics card without single precision.
+  // Null if the page cannot: it has no description of the lights, or the graphics card draws no single precision.
   static of(picture, shaders, data) {
     return picture.scene.resting && picture.single ? new Resting(picture, shaders, data) : null;
   }
@@ -40,7 +40,7 @@ export class Resting {
     this.trial = this.targets(...TRIAL);
   }
 
-  // Made when rays begin: the first picture need not wait for them.
+  // Compiled when rays begin, so that the first picture need not wait.
   get programs() {
     return (this.made ??= this.make());
   }
@@ -71,7 +71,7 @@ export class Resting {
     };
   }
 
-  // Start again at what `state` shows, unless only the exposure is another; `took` milliseconds a frame of lookups takes.
+  // Starts again for `state`, unless only the exposure has changed; a frame of lookups takes `took` milliseconds.
   begin(state, width, height, took) {
     const { picture } = this, size = String([width, height]);
     if (this.size !== size) {
@@ -99,7 +99,7 @@ export class Resting {
     return this.rays >= this.enough;
   }
 
-  // One more ray from every pixel of the next band.
+  // Traces one more ray from every pixel of the next band.
   step(state) {
     const { gl } = this;
     gl.enable(gl.SCISSOR_TEST);
@@ -136,9 +136,9 @@ export class Resting {
     gl.disable(gl.SCISSOR_TEST);
   }
 
-  // What the rays and the lookups of each surface are worth, from rays of their own: weights that depended on the rays
-  // they weigh would darken the picture. Two independent answers tell apart what rays and what lookups are off by; to the
-  // latter comes its own standard error: little trust where little is known.
+  // Measures the errors of rays and lookups on each surface, from separate rays: weights that depended on the rays that
+  // they weigh would darken the picture. Two independent halves separate the noise of rays from the error of lookups, to
+  // which its own standard error is added: a surface in few pixels gets little trust.
   judge(state) {
     const { gl, trial } = this, many = trial.width * trial.height;
     const read = (target, into = new Float32Array(4 * many)) => {
@@ -173,7 +173,7 @@ export class Resting {
     this.enough = Math.max(64, Math.min(MOST, Math.ceil(Math.max(...judged.map(([ray]) => ray)) / FINE ** 2)));
   }
 
-  // Lights that rays ask for one by one, at their weights.
+  // What rays aim at, one after the other; lights have their weights.
   aims(state) {
     const weighed = ({ light, color }) => color.map((x) => x * (light < 0 ? 1 : state.weights[light]));
     const discs = this.scene.resting.discs.slice(0, 8);
@@ -208,7 +208,7 @@ export class Resting {
     gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, ...size, gl.RGBA, gl.FLOAT, texels);
   }
 
-  // Roughness of each surface's coat, -1 without.
+  // Roughness of each surface's coat; -1: no coat.
   coats({ look }) {
     return [...Array(16).keys()].map((k) => (k >= this.scene.fields.length ? -1 : (this.scene.fields[k].rough ?? (look === "shiny" ? SHINY : -1))));
   }
@@ -221,7 +221,7 @@ export class Resting {
     return { "uSky[0]": total.flat(), uPictured: this.image ? 1 : 0 };
   }
 
-  // One ray from every pixel at these places within them, into the mean over `count` rays before.
+  // Adds one ray from every pixel, at this position within it, to the mean of `count` rays before.
   gather(into, state, count, place, isTrial, first = 0) {
     const { gl, picture, scene, programs } = this, { width, height } = into;
     gl.viewport(0, 0, width, height);

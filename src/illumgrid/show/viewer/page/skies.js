@@ -1,11 +1,11 @@
-// A smooth sky in spherical harmonics, a ball that shows it, and the hand that turns it: see illumgrid.field.lights.
+// A smooth sky in spherical harmonics, a ball that shows it, and the controls that turn it: see illumgrid.field.lights.
 
 import { facing, sum } from "./camera.js";
 import { element } from "./sweeps.js";
 
 const BALL = 96; // pixels
-const COSINE = [1, 2 / 3, 1 / 4, 0, -1 / 24]; // what a diffuse surface keeps of each degree (Ramamoorthi and Hanrahan 2001)
-const HEIGHTS = [[0, 0.5688888889], [0.5384693101, 0.4786286705], [0.9061798459, 0.2369268851]]; // of Gauss and Legendre
+const COSINE = [1, 2 / 3, 1 / 4, 0, -1 / 24]; // factor of each degree in the light of a diffuse surface (Ramamoorthi and Hanrahan 2001)
+const HEIGHTS = [[0, 0.5688888889], [0.5384693101, 0.4786286705], [0.9061798459, 0.2369268851]]; // Gauss-Legendre quadrature
 
 function basis([x, y, z], count) {
   const xx = x * x, yy = y * y, zz = z * z;
@@ -22,7 +22,7 @@ function basis([x, y, z], count) {
 
 const seen = (coefficients, functions) => [0, 1, 2].map((j) => functions.reduce((s, f, b) => s + f * coefficients[b][j], 0));
 
-// Coefficients of the sky tilted by degrees from back to up, then turned from back to right: sums over directions that are exact.
+// Coefficients of the sky tilted by degrees from back to up, then turned from back to right, by exact quadrature.
 export function skyTurned(coefficients, [turn, tilt]) {
   const [a, b] = [turn, tilt].map((degrees) => (degrees * Math.PI) / 180), count = coefficients.length;
   const made = coefficients.map(() => [0, 0, 0]);
@@ -40,7 +40,7 @@ export function skyTurned(coefficients, [turn, tilt]) {
   return made;
 }
 
-// Fills `place` with the ball; returns a function that shows a turn from a view.
+// Fills `place` with the ball; returns a function that draws a turn of the sky as seen from a view.
 export function skyBall(place, scene, get, put) {
   if (!scene.sky) return () => {};
   const canvas = element("canvas", { width: BALL, height: BALL, tabindex: 0, role: "slider", "aria-label": "Turn of the sky, degrees", "aria-valuemin": -180, "aria-valuemax": 180 });

@@ -1,4 +1,4 @@
-// What the page shows, and the same in its address.
+// The state of the page, and its form in the address.
 
 export const DEFAULTS = { sweep: 0.5, light: "global", split: 0.5, stops: 0, look: "matte", trust: false, rest: true, turn: [0, 0], clip: [-1, 0.5], tint: true };
 
@@ -9,7 +9,7 @@ export const sweepOf = ({ sweep: [first, last] }, isovalue) => (first === last ?
 export const lead = (scene) => scene.fields[scene.lead]; // the first field that is not held at one level
 export const isovalueOf = (field, sweep) => (1 - sweep) * field.sweep[0] + sweep * field.sweep[1];
 
-// "isovalue=0.45&view=0.52,0.31,4.1,0,0,0&light=both": only what is not as the page opens.
+// "isovalue=0.45&view=0.52,0.31,4.1,0,0,0&light=both": only what differs from the opened page.
 export function written(state, scene) {
   const parts = [`isovalue=${String(Number(isovalueOf(lead(scene), state.sweep).toPrecision(9)))}`];
   if (state.view.moved) {
@@ -29,7 +29,7 @@ export function written(state, scene) {
   return parts.join("&");
 }
 
-// The part of a state that an address holds; whatever is not understood is left out.
+// The part of a state that an address holds; invalid values are ignored.
 export function read(address, scene, looks) {
   const given = new URLSearchParams(address), state = {};
   const number = (name) => (given.has(name) && given.get(name) !== "" && Number.isFinite(Number(given.get(name))) ? Number(given.get(name)) : null);

@@ -13,7 +13,7 @@ function bars(counts, from, to, highest) {
   counts.forEach((count, k) => {
     const middle = (k + 0.5) / counts.length;
     if (count && middle >= from && middle <= to) {
-      const height = Math.max(1.5, Math.min(100, 100 * Math.sqrt(count / highest))); // a peak of background hides nothing
+      const height = Math.max(1.5, Math.min(100, 100 * Math.sqrt(count / highest))); // the root keeps a peak of background from hiding the rest
       path += `M${k} 100V${(100 - height).toFixed(1)}h1V100z`;
     }
   });
@@ -77,7 +77,7 @@ function fixed(field) {
   return { box: element("div", { class: "sweep" }, [element("div", { class: "head" }, [element("label", {}, [dot, `${field.name}, held at ${Number(field.sweep[0].toPrecision(4))}`])])]), show: () => {} };
 }
 
-// Fills `place`; returns a function that shows a share (0 to 1) of the common sweep on all sliders.
+// Fills `place`; returns a function that shows a position (0 to 1) of the common sweep on all sliders.
 export function sweeps(place, fields, put) {
   const made = fields.map((field, k) => (field.sweep[0] === field.sweep[1] ? fixed(field) : sweep(field, k, fields.length > 1, put)));
   place.replaceChildren(...made.map((m) => m.box));

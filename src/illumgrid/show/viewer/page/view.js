@@ -14,8 +14,8 @@ const REST = 160; // milliseconds without a change until a full frame is drawn
 const SMOOTH = 30; // milliseconds per frame during interaction
 const QUICK = 60; // frames faster than this are refined beyond the four samples of a still picture
 
-// Runs the view in `root`, which holds the markup. Options: address (keep the state there), onChange (called with the state),
-// get (answers what is asked for light that is still to come).
+// Runs the view in `root`, which holds the markup. Options: address (keep the state in it), onChange (called with the state),
+// get (gets light that is still being computed).
 export function view(root, scene, data, shaders, { address = true, onChange = () => {}, get } = {}) {
   const part = (name) => root.querySelector(`[data-part="${name}"]`);
   const canvas = part("canvas"), stage = part("stage");
@@ -120,12 +120,12 @@ export function view(root, scene, data, shaders, { address = true, onChange = ()
     else still();
   }
 
-  // Gathered light, while nothing changes: browsers ask for no frames of pages that are hidden.
+  // Gathers light while nothing changes; browsers request no frames of hidden pages.
   function rest() {
     if (!resting.done) resting.step(state);
     resting.show(state.stops);
     picture.wait();
-    part("rays").value = `${resting.rays} rays a pixel`;
+    part("rays").value = `${resting.rays} rays per pixel`;
     if (!resting.done) draw(false);
   }
 
@@ -136,7 +136,7 @@ export function view(root, scene, data, shaders, { address = true, onChange = ()
       try {
         resting.begin(state, canvas.width, canvas.height, view_.took);
         draw(false);
-      } catch (error) {  // a driver may refuse shaders of rays alone: lookups go on
+      } catch (error) {  // a driver may refuse the shaders of rays only: lookups go on
         console.warn(error.message);
         resting = null;
         rests = false;
@@ -215,7 +215,7 @@ export function view(root, scene, data, shaders, { address = true, onChange = ()
   return view_;
 }
 
-// A sentence in place of the picture.
+// Shows a sentence in place of the picture.
 export function complain(root, sentence) {
   const place = root.querySelector('[data-part="message"]');
   place.textContent = sentence;

@@ -1,10 +1,10 @@
-// The same view in a notebook: the traits of the anywidget model follow the view, and set it.
+// The same view in a notebook: the traits of the anywidget model and the view follow each other.
 
 import { inflate } from "./numbers.js";
 import { isovalueOf, lead, sweepOf } from "./state.js";
 import { complain, view } from "./view.js";
 
-// The kernel's answer to a question, by messages; `left` says whether the view is gone.
+// Gets the kernel's answer to a request by messages; `left` says whether the view is gone.
 const asking = (model, left) => (question) => new Promise((done, fail) => {
   const number = Math.random();
   const hear = (said, buffers) => {
