@@ -1,4 +1,4 @@
-"""Commands of the gallery, on real volumes if ``../shared/volumes`` exists beside the project, else on made-up ones."""
+"""Commands of the gallery, on real volumes if ``../shared/volumes`` has them, else on synthetic ones."""
 
 import shlex
 import subprocess
@@ -20,14 +20,14 @@ def _real(name):
 
 
 def has(name):
-    """Whether a volume is there; its name then stands for it in the commands."""
+    """Whether a volume exists; if so, commands can use its name."""
     if path := _real(name):
         (RUNS / name).symlink_to(path)
     return path is not None
 
 
 def arms():
-    """Write ``arms.csv``, points along the arms of a made-up neuron."""
+    """Write ``arms.csv``, points along the arms of a synthetic neuron."""
     t, body = np.linspace(0, 1, 160), []
     for k in range(7):
         turn = 0.9 * k + 2.4 * t + 0.3 * np.sin(9 * t + k)
@@ -44,7 +44,7 @@ def folds():
 
 
 def command(line):
-    """Run a line as in a terminal, in `RUNS`; returns the picture that it writes at last, if any, as an array."""
+    """Run a line as in a terminal, in `RUNS`; return the picture that its last command writes, if any, as an array."""
     for part in line.split("&&"):
         words = shlex.split(part)
         subprocess.run([sys.executable, "-m", *words], cwd=RUNS, check=True, capture_output=True)

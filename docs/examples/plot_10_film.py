@@ -6,7 +6,7 @@ Figure 8 of Banks and Beason (2007): particles attach themselves to a ball, and 
 like a film. The film transmits light, so the ball inside is lit through it, and both are shiny.
 
 The density of the particles is a field whose isovalue is swept. The ball is a second field, held at one isovalue: its
-light is computed for several places of the sweep, since it changes with the film around it.
+light is computed for several positions of the sweep, because it changes with the film around it.
 """
 
 from dataclasses import replace
@@ -20,7 +20,7 @@ from illumgrid.show import fit_camera, render, widest_row
 from illumgrid.show.exact import Exact
 
 rng = np.random.default_rng(8)
-sites = rng.normal(size=(7, 3))  # where particles gather on the ball
+sites = rng.normal(size=(7, 3))  # where particles attach to the ball
 sites *= 0.62 / np.linalg.norm(sites, axis=1, keepdims=True)
 particles = np.concatenate([site + 0.2 * rng.normal(size=(400, 3)) for site in sites])
 density = ig.density(particles, spacing=0.06, sigma=0.16)
@@ -40,7 +40,8 @@ light = ig.run(scene, grid=32, paths=32)
 
 # %%
 # **What to look for:** the ball shines through the film and is tinted by it; the inner side of the far wall of the film
-# is seen as well, lit by what comes through. Highlights are images of the key light, and follow the film as it shrinks.
+# is visible as well, lit by transmitted light. Highlights are images of the key light, and follow the film as it
+# shrinks.
 
 camera = fit_camera(scene, widest_row(scene), 4 / 3)
 figure, axes = plt.subplots(1, 3, figsize=(10.5, 3.0), facecolor="0.235", layout="constrained")

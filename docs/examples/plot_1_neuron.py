@@ -21,7 +21,7 @@ FIGURE_1 = (
 )
 
 # %%
-# Where that volume is missing, the gallery shows arms that are made of points.
+# If that volume is missing, the gallery shows arms made of points.
 
 MADE_UP = (
     "illumgrid density arms.csv -o arms.nrrd --spacing 0.025 --sigma 0.035 && illumgrid run arms.nrrd --scene floor "

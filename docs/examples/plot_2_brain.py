@@ -2,8 +2,8 @@
 A brain: how deep is a fold?
 ============================
 
-Figure 2 of Banks and Beason (2007): the folds of a brain. Local light draws every fold, deep or shallow, as the same
-dark line. Global light reaches the bottom of a wide valley and not that of a narrow one.
+Figure 2 of Banks and Beason (2007) shows the folds of a brain. Local light draws every fold, deep or shallow, as the
+same dark line. Global light reaches the bottom of a wide valley and not that of a narrow one.
 """
 
 import matplotlib.pyplot as plt
@@ -19,7 +19,7 @@ FIGURE_2 = (
 )
 
 # %%
-# Where that volume is missing, the gallery shows a folded ball.
+# If that volume is missing, the gallery shows a folded ball.
 
 MADE_UP = (
     "illumgrid run folds.npy --range 0.15 0.45 --albedo 0.8 0.66 0.6 --no-preview -o brain && "

@@ -5,7 +5,7 @@ Levels and samples: from isosurfaces to a grid
 Figure 5 of Banks and Beason (2007) shows how a grid is computed: light is sampled at points scattered over some
 isosurfaces (the sampler ``uniform``), and each node of the grid takes the light of the nearest point. Few isosurfaces
 leave gaps, whose nodes take light from another isosurface than their own; many isosurfaces close the gaps. The sampler
-``direct`` asks for light at the nodes themselves, each on the isosurface through it.
+``direct`` places its queries at the nodes themselves, each on the isosurface through it.
 
 The scene is that of the paper: one blob in a box, with a red wall on the left, a green one on the right, and a
 luminaire at the bottom.
@@ -29,7 +29,7 @@ scene = ig.Scene.box(volume, range=(0.25, 0.85))
 # Top: the isosurfaces that three settings sample, in the slice through the middle of the field. Bottom: the resulting
 # pictures, all at one isovalue that none of them sampled.
 #
-# **What to look for:** with three levels the surface is blotched, because its nodes have the light of isosurfaces with
+# **What to look for:** with three levels the surface is blotched, because its nodes take light from isosurfaces with
 # other positions and orientations. With twelve levels the blotches shrink. ``direct`` has none; only the noise of 64
 # paths remains.
 
@@ -60,8 +60,8 @@ for (name, sampler), top, bottom in zip(samplers.items(), *axes):
 plt.show()
 
 # %%
-# The same from the command line: blobs from ten points, tints on either side, a shadow on the ceiling, which the
-# luminaire at the bottom throws upwards.
+# The same from the command line, with blobs from ten points: tints on either side, and on the ceiling a shadow that the
+# luminaire at the bottom casts upwards.
 
 points = [
     "-.45,-.1,.1", "-.2,.25,.35", "-.05,-.3,.2", ".1,.15,-.1", ".35,-.15,.3", ".45,.2,0", ".2,-.35,-.3",

@@ -2,9 +2,9 @@
 The grid itself
 ===============
 
-Figure 6 of Banks and Beason (2007): the illumination grid as a block of light. Each of its points has the colour that
-the isosurface through that point shows there. A new isovalue only cuts another isosurface out of this block. Where no
-isosurface of the range passes there is no light, and nothing is drawn.
+Figure 6 of Banks and Beason (2007) shows the illumination grid as a block of light. Each of its points has the colour
+that the isosurface through that point shows there. A new isovalue only selects another isosurface in this block. Where
+no isosurface of the range passes there is no light, and nothing is drawn.
 """
 
 import matplotlib.pyplot as plt

@@ -19,7 +19,7 @@ strip = command("illumgrid preview nucleus --isovalues 0.32,0.45,0.58 --size 480
 
 # %%
 # **What to look for:** the shadow on the floor, and the red and green light that the walls reflect, follow the surfaces
-# from left to right, while the dumbbell comes apart. The ring tints the cluster within it.
+# from left to right, while the dumbbell separates. The ring tints the cluster within it.
 
 figure, ax = plt.subplots(figsize=(10.5, 2.8), facecolor="0.235", layout="constrained")
 ax.imshow(strip)
@@ -27,7 +27,7 @@ ax.set_axis_off()
 plt.show()
 
 # %%
-# With a lamp at the camera only (left), the picture does not show how far the ring is from the walls, nor that light
+# With only a lamp at the camera (left), the picture shows neither how far the ring is from the walls nor that light
 # comes from above.
 
 split = command("illumgrid preview nucleus --split --size 720 540 -o split.png")

@@ -2,7 +2,7 @@
 From points to a field
 ======================
 
-Figures 7 and 8 of Banks and Beason (2007) are densities of point masses: nucleons, and the particles of a molecular
+Figures 7 and 8 of Banks and Beason (2007) show densities of point masses: nucleons, and the particles of a molecular
 dynamics run. :func:`illumgrid.density` makes such fields from lists of points; on the command line
 ``illumgrid density`` does, and a scene file takes ``points = "atoms.xyz"``.
 """
@@ -16,7 +16,7 @@ from illumgrid.show import render
 
 # %%
 # Figure 7: eight protons and eight neutrons, each a point spread by a Gaussian. Both fields share one sweep, here of
-# densities up to four fifths of the larger maximum, in the light of the studio.
+# densities up to four fifths of the smaller maximum, in the light of the studio.
 
 
 def nucleons(count, turn):
