@@ -183,7 +183,7 @@ class BackendTests(_StageTests):
             assert array.shape == shape, f"{name} has shape {array.shape}; expected {shape}"
             assert array.dtype == np.dtype(kind), f"{name} is {array.dtype}; expected {np.dtype(kind)}"
             assert np.isfinite(array).all() and (array >= 0).all(), f"{name} is negative or not finite"
-        assert set(answer.paths.tolist()) <= {0, 8}, "paths is neither the number asked for nor 0"
+        assert set(answer.paths.tolist()) <= {0, 8}, "paths is neither the requested number nor 0"
         assert answer.paths.any() and answer.mean.any(), "nothing was answered"
 
     def test_equal_seeds_give_equal_answers(self) -> None:

@@ -52,7 +52,7 @@ class Mitsuba:
         return None
 
     def prepare(self, scene):
-        """Describe what all level sets share; their meshes are built when they are asked for."""
+        """Describe what all level sets share; their meshes are built on request."""
         from illumgrid_mitsuba.tracer import MitsubaTracer
 
         return MitsubaTracer(self, scene)

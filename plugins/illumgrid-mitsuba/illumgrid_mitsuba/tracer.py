@@ -1,6 +1,6 @@
-"""Light at queries by Mitsuba: one scene of meshes for each row of levels, and two ways to ask it.
+"""Light at queries by Mitsuba: one scene of meshes for each row of levels, and two ways to sample it.
 
-At a Lambertian surface the irradiance is gathered: emitters are asked for light, and a path is followed along a
+At a Lambertian surface the irradiance is gathered: emitters are sampled, and a path is followed along a
 direction with the density of the cosine, with weights of the balance heuristic. Of a field with a material of its own
 light is taken that leaves it, averaged over directions by the cosine and divided by the field's albedo: for a
 Lambertian surface that is the irradiance, too, and a picture, which multiplies by the albedo, shows what leaves.

@@ -123,7 +123,7 @@ def emission_weight(
     """Weight (n,) of what surfaces emit towards the ends of rays that left along d, by the cosine about `normal`.
 
     It is 1 but on walls. A quad emits on its front only, where `approach`, the cosine for each wall, is negative. A
-    lamp is asked for light as well: it has the weight of the balance heuristic.
+    lamp is also sampled directly, so it has the weight of the balance heuristic.
     """
     weight = np.ones(len(t))
     by_cosine = np.einsum("ij,ij->i", normal[wall], d[wall]) / np.pi

@@ -225,7 +225,7 @@ def write_folder(path: str | os.PathLike[str], files: Iterator[tuple[str, bytes]
     Raises
     ------
     BadInput
-        If something is there already, before the first file is asked for; or if it cannot be written.
+        If something is there already, before the first file is requested; or if it cannot be written.
     """
     claim_new(path)
     place = Path(os.path.abspath(path))

@@ -336,7 +336,7 @@ def _tilted(normal: Floats, angle: float) -> Floats:
 def disc() -> Case:
     """Discs of the sky: E = π L sin²α cos θ for half-angle α at angle θ from the normal, θ + α <= π/2. Exact.
 
-    A soft key, and a sun: hardly any path finds it by chance. Both are asked for by the same rays.
+    A soft key, and a sun, which hardly any path finds by chance. The same rays sample both.
     """
     field, queries, normal = _facing_up()
     lights = tuple(

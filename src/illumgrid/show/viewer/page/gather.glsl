@@ -1,4 +1,4 @@
-// One ray from each pixel's origin: cosine-distributed, or to a light that shadow rays ask for.
+// One ray from each pixel's origin: cosine-distributed, or aimed at a light.
 const int OPEN = 0, DISC = 1, LAMP = 2, MIRROR = 3, IMAGE = 4;
 
 uniform sampler2D uPlace, uNormals;  // of origins, see origin.frag
@@ -9,8 +9,8 @@ uniform float uCosine;               // and the cosine of its half-angle
 uniform vec3 uLamp0, uLampU, uLampV, uLampNormal;
 uniform vec3 uShine;                 // radiance of the disc or the lamp, as the exposure shows it
 uniform vec3 uEyeAt;
-uniform sampler2D uImage;            // of the sky: radiance as the exposure shows it, and the sum up to each pixel of what is asked for
-uniform float uSoft;                 // mean colour up to which escaping rays find a pixel; what is above it is asked for
+uniform sampler2D uImage;            // of the sky: radiance as the exposure shows it, and the sum up to each pixel of the excess that rays aim at
+uniform float uSoft;                 // mean colour up to which escaping rays find a pixel; rays aim at the excess
 uniform vec3 uSkyAxes[3];            // right, back and up
 uniform float uCoats[16];            // roughness of each surface's coat, below 0 without
 uniform bool uOnward;                // from where the first ray ended too soon: this one ends where it lands
@@ -26,7 +26,7 @@ vec4 pixel(int k, ivec2 size) { return texelFetch(uImage, ivec2(k % size.x, k / 
 float bright(vec3 light) { return dot(light, vec3(1.0 / 3.0)); }
 float heightOf(float y, ivec2 size) { return 3.14159265 * (0.5 - y / float(size.y)); }
 
-// Light of the image at a place in pixels, bilinear: (what escaping rays find, that times cosine of height, as it is asked for).
+// Light of the image at a place in pixels, bilinear: `soft` is found by escaping rays, `hard` is the excess that rays aim at, `asked` its density.
 void image(vec2 place, out vec3 soft, out vec3 hard, out float asked) {
   ivec2 size = textureSize(uImage, 0);
   vec2 at = vec2(place.x, clamp(place.y, 0.5, float(size.y) - 0.5)) - 0.5, f = fract(at);
@@ -50,7 +50,7 @@ vec2 placeOf(vec3 ray) {
   return size * vec2((x == 0.0 && y == 0.0 ? 0.0 : atan(x, y)) / 6.2831853 + 0.5, acos(clamp(dot(uSkyAxes[2], ray), -1.0, 1.0)) / 3.14159265);
 }
 
-// A direction to what is asked for: a pixel by its brightness, then a place about it, so that the density is bilinear, too.
+// Aims at the excess: at a pixel by its brightness, then at a place about it, so that the density is bilinear, too.
 void toImage(inout Ray ray, vec3 normal, vec2 u) {
   ivec2 size = textureSize(uImage, 0);
   int low = 0, high = size.x * size.y - 1;
