@@ -118,6 +118,10 @@ def test_thin_parts_are_reported_with_the_grid_that_would_do():
     assert "thin" not in findings(ball(40), (0.3, 0.9))
 
 
+def test_of_a_solid_that_fills_the_border_the_other_side_is_suggested():
+    assert "use --inside above" in findings(ball(20), (0.3, 0.9), inside="below")["border"]
+
+
 def test_the_border_is_reported_with_its_planes():
     found = findings(ball(20, at=(0.6, 0, 0)), (0.3, 0.9))["border"]
     assert "the last x plane" in found and "first" not in found

@@ -131,6 +131,8 @@ def test_the_library_and_info_refuse_as_well_and_an_export_needs_nothing(refuse,
     free(1000)
     with pytest.raises(BadInput, match=r"the run needs .* cut or downsample the volume"):
         ig.run(Scene.sky(ball(10)), paths=1)
+    with pytest.raises(BadInput, match=r"the run needs .* use fewer isovalues or texels"):
+        ig.run(Scene.floor(ball(10)), paths=1, isovalues=100_000)
     exports.write(light, tmp_path / "a.exr", on="field")  # a part at a time
     refuse("info", "v.npy", words=["info needs", "--downsample"])
 

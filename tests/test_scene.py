@@ -70,12 +70,17 @@ def test_a_side_that_is_none_is_refused():
     refused(lambda: Field("a", ball(), inside="left"), "'left'", "'above' or 'below'")
 
 
-def test_a_field_replaces_what_is_not_finite_and_says_so():
+@pytest.mark.parametrize(
+    ("odd", "said"),
+    [([np.nan], {"NaN"}), ([np.inf, -np.inf], {"infinities"}), ([np.nan, np.inf], {"NaN", "infinities"})],
+)
+def test_a_field_replaces_what_is_not_finite_and_says_so(odd, said):
     values = ball(6).values.copy()
-    values[0, 0, 0] = np.nan
-    with pytest.warns(IllumgridWarning, match="1 of 216 voxels"):
+    values[0, 0, : len(odd)] = odd
+    with pytest.warns(IllumgridWarning, match=f"{len(odd)} of 216 voxels") as noted:
         field = Field("a", Volume(values), range=(0.3, 0.9))
     assert np.isfinite(field.volume.values).all()
+    assert {word for word in ("NaN", "infinities") if f"{word} became" in str(noted[0].message)} == said
 
 
 def test_a_scene_needs_a_field_and_names_that_differ():

@@ -66,7 +66,7 @@ def say_what_compiles() -> None:
     def note(record: logging.LogRecord) -> bool:
         now = time.monotonic()
         if not begun:
-            say("compiling, once on this machine: this may take a minute")
+            say("compiling, once for each kind of data and scene: this may take a minute")
             begun.extend((now, now))
         elif now - begun[1] >= INTERVAL:
             begun[1] = now

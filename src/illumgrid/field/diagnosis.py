@@ -296,11 +296,14 @@ def _border(field: Field) -> Iterator[Finding]:
                 faces.append(f"the {side} {letter}")
     widest = field.widest if field.isovalue is None else field.isovalue
     if touched > _TOUCHED * total:
+        todo = "take a larger crop, or a --range farther inside"
+        if touched > total / 2:
+            todo = f"if the solid is what surrounds the object, use --inside {'below' if field.upward > 0 else 'above'}"
         yield Finding(
             "border",
             f"at {shown(widest, field.range)} the solid of field {field.name!r} meets the volume's border "
             f"({', '.join(faces)} plane, {_below(touched / total)} of the border), where it is cut and closed by a "
-            "flat cap; take a larger crop, or a --range farther inside",
+            f"flat cap; {todo}",
         )
 
 

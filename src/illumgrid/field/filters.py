@@ -16,10 +16,13 @@ def finite(volume: Volume, inside: Side) -> Volume:
     lowest, highest = volume.extremes
     farthest = lowest if UPWARD[inside] > 0 else highest
     where = np.unravel_index(int(np.argmin(good)), volume.shape)
+    infinite = int(np.count_nonzero(np.isinf(volume.stored)))
+    became = [f"NaN became {farthest:g}, the value farthest outside"] if volume.gaps > infinite else []
+    became += [f"infinities became {lowest:g} and {highest:g}"] if infinite else []
     tell(
         "finite",
-        f"{volume.gaps} of {good.size} voxels are not finite (the first at {tuple(map(int, where))}): NaN became "
-        f"{farthest:g}, the value farthest outside, infinities became {lowest:g} and {highest:g}",
+        f"{volume.gaps} of {good.size} voxels are not finite (the first at {tuple(map(int, where))}): "
+        + ", ".join(became),
         stacklevel=2,
     )
     return volume.with_stored(np.nan_to_num(volume.stored, nan=outermost, posinf=high, neginf=low))

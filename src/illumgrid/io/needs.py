@@ -73,7 +73,8 @@ def check_run(
     channels = len(channels_of(scene))
     each = _QUERY + _CHANNEL * channels
     fixed = sum(of_field(prod(field.volume.shape), TO_LIGHT) for field in scene.fields)
-    fixed += each * (len(levels.table) * sum(prod(quad.texels) for quad in scene.quads) + at_nodes * _PIECE)
+    walls = each * len(levels.table) * sum(prod(quad.texels) for quad in scene.quads)
+    fixed += walls + each * at_nodes * _PIECE
     nodes = finer_nodes = 0.0
     for spec, field in zip(specs, scene.fields):
         share, moments = _share(field, spec), 8 + 8 * channels if at_nodes else each
@@ -86,7 +87,7 @@ def check_run(
         finer_nodes += (_BLOCK + _BLOCK_CHANNEL * channels) * held + _FINEST * finest
     longest, room = max(max(spec.shape) for spec in specs), 0.8 * free_memory() - fixed
     fits = int(longest * (max(room, 0.0) / nodes) ** (1 / 3))
-    todo = "cut or downsample the volume"
+    todo = "use fewer isovalues or texels" if walls > fixed / 2 else "cut or downsample the volume"
     if fits >= 8:
         todo = f"grid={fits} would need {gigabytes(int(fixed + nodes * (fits / longest) ** 3))}"
     check("the run", fixed + (finer_nodes if refining else nodes), todo)
