@@ -9,10 +9,9 @@ import pytest
 
 import illumgrid as ig
 import naive
-from illumgrid import bake
 from illumgrid.backends.numba_ import Numba
 from illumgrid.backends.reference import Reference
-from illumgrid.bake import ahead
+from illumgrid.bake import ahead, targets
 from illumgrid.bake.ahead import light_ahead
 from illumgrid.bake.bounces import enough_bounces
 from illumgrid.bake.known import MOST_BIAS, light_known_first
@@ -241,7 +240,7 @@ def test_a_cache_goes_when_the_paths_that_end_in_it_are_walked(monkeypatch):
         return fill_nodes(*about)
 
     monkeypatch.setattr(ahead, "light_known_first", ending)
-    monkeypatch.setattr(bake, "fill_nodes", fill)
+    monkeypatch.setattr(targets, "fill_nodes", fill)
     scene = ig.Scene.box(ball(12), range=(0.3, 1.2))
     assert ig.run(scene, grid=12, paths=2, judge=False).recipe["cache"]
     assert left == [[], [False]]  # the coarse grid of the cache, and what was lit with it
