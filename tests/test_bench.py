@@ -462,7 +462,11 @@ def test_of_fields_of_different_size_the_marked_setting_lights_the_nodes_of_each
     assert [max(spec.shape) for spec in specs] == [14, 7]
 
 
-def test_pictures_of_grids_are_compared_with_one_of_traced_light(monkeypatch):
+CUT = Scene.studio(ball(14, at=(0.5, 0.0, 0.0)), range=(0.4, 0.9))  # with a cap, and lights in channels of their own
+
+
+@pytest.mark.parametrize("scene", [SCENE, CUT])
+def test_pictures_of_grids_are_compared_with_one_of_traced_light(scene, monkeypatch):
     """FLIP itself is an extra; here the mean difference stands for it."""
     from illumgrid.show import difference
 
@@ -472,7 +476,7 @@ def test_pictures_of_grids_are_compared_with_one_of_traced_light(monkeypatch):
     monkeypatch.setitem(sys.modules, "flip_evaluator", flip)
     monkeypatch.setattr(difference, "PATHS", 2)
     paths = 2 * difference.SIDE**2 * 50**2 * (4 / 3) * 0.4  # for a picture of 64 x 48
-    compare = difference.studio(SCENE, TRACER, 1.0, 2, 0, paths)
-    grids = list(run(SCENE, grid=12, paths=16, bounces=2).grids)
+    compare = difference.studio(scene, prepare(BACKEND, scene), 1.0, 2, 0, paths)
+    grids = list(run(scene, grid=12, paths=16, bounces=2).grids)
     dark = [replace(grid, values=np.zeros_like(grid.light)) for grid in grids]
     assert compare(grids) < 0.02 < compare(dark)

@@ -3,7 +3,7 @@
 import importlib.util
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from illumgrid.field.scene import Scene, level_table
 from illumgrid.field.volume import Floats
 from illumgrid.grid import IlluminationGrid, WallTexture
+from illumgrid.grid.channels import RGB, Channels
 from illumgrid.light import Illumination
 from illumgrid.rng import shifted_seed
 from illumgrid.show import render
@@ -38,6 +39,7 @@ class Traced:
     field: int
     bounces: int
     seed: int
+    channels: ClassVar[Channels] = RGB  # of caps: all light together
 
     def lookup(self, points: Floats, t: float = PLACE) -> NDArray[np.float32]:
         """Irradiance (n, 3) on the level set of the picture, at `t` in the sweep."""
