@@ -58,6 +58,25 @@ def method(sampler, denser=None):
 METHOD = method(Direct())
 
 
+class Clocked:
+    """A tracer that takes a second for each path, on a clock of its own."""
+
+    def __init__(self, tracer):
+        self.tracer, self.seconds = tracer, 0.0
+
+    def solve(self, queries, *, paths, **how):
+        self.seconds += len(queries) * len(paths)
+        return self.tracer.solve(queries, paths=paths, **how)
+
+
+@pytest.fixture
+def clocked(monkeypatch):
+    """`METHOD` in a race whose clock counts its paths."""
+    tracer = Clocked(TRACER)
+    monkeypatch.setattr(races, "time", SimpleNamespace(perf_counter=lambda: tracer.seconds))
+    return replace(METHOD, tracer=tracer)
+
+
 @pytest.fixture(scope="module")
 def truth():
     return SCENE, begin(TRACER, unseen_on_level_sets(SCENE, 8, 200, 0), 8, 0, 256)
@@ -261,22 +280,23 @@ def test_run_says_what_would_help_noisy_data(call, tmp_path):
     assert "note: grid: the interpolation error between nodes" in said and "--smooth 1" in said
 
 
-def test_what_is_foreseen_of_a_grid_is_what_the_grid_will_hold(truth):
+def test_what_is_foreseen_of_a_grid_is_what_the_grid_will_hold(truth, clocked):
     scene, exact = truth
-    race = Race(scene, {"levelset": exact}, [METHOD], [9, 21], 3, 5)
-    race.predict(METHOD, Nearest(), 21, 8, default=True)
+    race = Race(scene, {"levelset": exact}, [clocked], [9, 21], 3, 5)
+    race.predict(clocked, Nearest(), 21, 8, default=True)
     (seen,) = race.points
-    assert seen.default and not seen.built and seen.seconds == [seen.time] * 3 and seen.time > 0 and seen.paths == 8
+    assert seen.default and not seen.built and seen.paths == 8
+    assert seen.seconds == pytest.approx([8 * seen.queries] * 3)
     asked = exact.queries
     for seed, light in zip((5, 6, 7), seen.light):
-        run = Run(scene, METHOD, 21, 3, seed)
+        run = Run(scene, clocked, 21, 3, seed)
         run.go_on(8)
         grids = run.fill(Nearest())[0]
         whole = seen.covered & look_up(grids, asked)[1]
         assert whole.mean() > 0.9
         np.testing.assert_allclose(light[whole], grids[0].lookup(asked.point[whole]), rtol=1e-4, atol=1e-5)
     assert seen.queries == sum(map(len, run.bake.answers)) and not race.missing_seeds()  # it needs no more seeds
-    race.contestants = [Run(scene, METHOD, 21, 3, 5)]
+    race.contestants = [Run(scene, clocked, 21, 3, 5)]
     while contestant := race.next(np.inf):
         race.advance(contestant)
     assert [p.built for p in race.points if p.paths == 8] == [True]  # what is built takes its place
@@ -309,19 +329,19 @@ def test_it_reports_where_runs_default_stands(truth):
     assert "run's default (about 15 s, error 20.00%) is on the front" in report.advice(records, PARTS, 5)
 
 
-def test_a_default_that_is_too_costly_is_foreseen_and_so_are_its_neighbours(truth):
+def test_a_default_that_is_too_costly_is_foreseen_and_so_are_its_neighbours(truth, clocked):
     scene, exact = truth
-    race = Race(scene, {"levelset": exact}, [METHOD], [5, 11, 22], 3, 0)
+    race = Race(scene, {"levelset": exact}, [clocked], [5, 11, 22], 3, 0)
     said = _show_default(race, 11, 32, 1e-6, 1e-6)
     assert "~" in said[0] and [(p.grid, p.paths, p.built) for p in race.points] == [(11, 32, False)]
     # A second a path: there is time for three seeds of 8 paths, not of 32.
-    race = Race(scene, {"levelset": exact}, [METHOD], [5, 11, 22], 3, 0)
+    race = Race(scene, {"levelset": exact}, [clocked], [5, 11, 22], 3, 0)
     _show_default(race, 22, 32, (3 * 8 * 8 * len(exact) + 1000) / 0.15, 1.0)
     assert {(p.grid, p.paths, p.default) for p in race.points} == {(22, 32, True), (11, 8, False), (22, 8, False)}
     assert not any(p.built for p in race.points)
     shown = {(p.grid, p.paths): p for p in race.points}
-    assert shown[22, 32].time > shown[22, 8].time and shown[22, 8].queries > 4 * shown[11, 8].queries
-    race = Race(scene, {"levelset": exact}, [METHOD], [5, 11, 22], 3, 0)
+    assert shown[22, 32].time == pytest.approx(4 * shown[22, 8].time) == pytest.approx(32 * shown[22, 8].queries)
+    race = Race(scene, {"levelset": exact}, [clocked], [5, 11, 22], 3, 0)
     assert not _show_default(race, 11, 32, 1e6, 1e-6)
     assert [(p.grid, p.paths, p.built) for p in race.points] == [(11, 32, True)]
 

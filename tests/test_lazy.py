@@ -251,7 +251,8 @@ def test_a_page_becomes_what_it_would_be_if_all_light_had_been_there(browser, sc
         first = browser.pixels()
         before = as_it_is(live, coarse)
         gate.set()
-        until(browser.page, "document.querySelector('[data-part=subtitle]').textContent.includes('light is complete')")
+        subtitle = "document.querySelector('[data-part=subtitle]').textContent"
+        until(browser.page, f"{subtitle}.startsWith('The light is complete')")
         last = browser.pixels()
         server.shutdown()
     work.join()
