@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from illumgrid.errors import BadInput
-from illumgrid.field.lattice import GridSpec
+from illumgrid.field.lattice import GridSpec, along_longest
 from illumgrid.grid import channels_of
 from illumgrid.grid.nested import finer, halvings
 from illumgrid.io.readers.limits import free_memory, gigabytes
@@ -85,7 +85,7 @@ def check_run(
         finest = prod(finer(spec, halvings(specs)).shape)
         held = min(_IN_BLOCKS * prod(spec.shape) * share, _SPARE * finest)
         finer_nodes += (_BLOCK + _BLOCK_CHANNEL * channels) * held + _FINEST * finest
-    longest, room = max(max(spec.shape) for spec in specs), 0.8 * free_memory() - fixed
+    longest, room = along_longest(specs), 0.8 * free_memory() - fixed
     fits = int(longest * (max(room, 0.0) / nodes) ** (1 / 3))
     todo = "use fewer isovalues or texels" if walls > fixed / 2 else "cut or downsample the volume"
     if fits >= 8:
